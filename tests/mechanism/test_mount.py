@@ -18,7 +18,7 @@ def test_mounts_are_rigid_and_round_trip(height, p, q):
     mount = Mount(height)
     np.testing.assert_allclose(mount.to_paper(mount.to_world(p)), p, atol=1e-14)
     np.testing.assert_allclose(mount.to_world(mount.to_paper(p)), p, atol=1e-14)
-    turn, origin = np.array(mount.frame)
+    turn, origin = mount.frame
     np.testing.assert_array_equal(turn * p + origin, mount.to_world(p))
     matrix = mount.rotate(np.eye(3)).T
     assert np.linalg.det(matrix) == pytest.approx(1)

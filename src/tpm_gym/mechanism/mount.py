@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -50,9 +52,14 @@ class Mount:
         turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
         return turned
 
-    @property
-    def frame(self) -> tuple[Vector, Vector]:
-        """Factors and origin (m), so that world = factors * point + origin, and back."""
+    @cached_property
+    def frame(self) -> tuple[FloatArray, FloatArray]:
+        """Factors and origin (3,), so that world = factors * point + origin, and back."""
+        return _HALF_TURN, np.array([0.0, 0.0, self.height])
+
+    @cached_property
+    def plain_frame(self) -> tuple[Vector, Vector]:
+        """:attr:`frame` in plain floats."""
         return (1.0, -1.0, -1.0), (0.0, 0.0, self.height)
 
     @property
@@ -64,3 +71,9 @@ class Mount:
     def quaternion(self) -> Quaternion:
         """Orientation of the paper frame in the world, (x, y, z, w)."""
         return (1.0, 0.0, 0.0, 0.0)
+
+    @staticmethod
+    def tilt(quaternion: Quaternion) -> float:
+        """Compute the angle between an orientation (x, y, z, w) and the paper frame, rad."""
+        _, y, z, w = quaternion
+        return 2 * math.asin(min(1.0, math.hypot(y, z, w)))

@@ -118,7 +118,7 @@ class Readout(NamedTuple):
             objects: Pose and velocities of each object.
         """
         (theta, rates, torque), (gap, (x, y, z), tilt) = motors, truth
-        (a, b, c), (u, v, w) = machine.mount.frame
+        (a, b, c), (u, v, w) = machine.mount.plain_frame
         own = a * (x - u), b * (y - v), c * (z - w)
         numbers = [*theta, *rates, *torque, x, y, z, tilt, gap, hold.vacuum, *own]
         for (where, orientation), (velocity, spin) in objects:

@@ -120,7 +120,7 @@ class Simulation:
             raise
         self._plants = [NOMINAL] * count
         self._weights = spline_weights(steps)
-        self._frame = tuple(map(np.array, machine.mount.frame))
+        self._frame = machine.mount.frame
         self._region = np.array(machine.region.low), np.array(machine.region.high)
         # The last two commands and the next command, machine's frame, m
         self._commands = np.zeros((count, 3, 3))

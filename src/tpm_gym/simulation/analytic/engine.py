@@ -103,7 +103,7 @@ class AnalyticEngine:
         self._bias = np.zeros((count, 3))
         servo, step = self._servo, self.time_step
         self._contact = Contact(
-            scene.objects, count, step, machine.table, machine.mount.frame, scene.belt
+            scene.objects, count, step, machine.table, machine.mount.plain_frame, scene.belt
         )
         self._drives = None if servo is None else ServoDrives(servo, machine, count, step)
         home = machine.require_inverse(np.array(machine.home))

@@ -18,6 +18,7 @@ import numpy as np
 from tpm_gym.arrays import Quaternion, Vector, rotate
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.mjcf import STIFF, site_names
+from tpm_gym.mechanism.mount import Mount
 from tpm_gym.simulation.engine import SPRING_GAIN, transform
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 
@@ -136,8 +137,7 @@ class Robot:
         gaps = data.site_xpos[side] - data.site_xpos[other]
         origin, turn = self._frame(self._platform)
         gap = math.sqrt((gaps * gaps).sum(axis=1).max(initial=0.0))
-        tilt = 2 * math.asin(min(1.0, math.hypot(*turn[1:])))  # from the mount's half turn about x
-        return gap, transform(origin, turn, self._point_p), tilt
+        return gap, transform(origin, turn, self._point_p), Mount.tilt(turn)
 
     def cup(self) -> tuple[Vector, Vector]:
         """Return the centre of the cup's lip (m) and the cup's outward axis; world frame."""
