@@ -131,7 +131,7 @@ def test_an_event_is_a_truth_value_with_a_name_of_its_own(sorting):
         tpm_gym.TPMEnv(wrong)
     wrong = type("Wrong", (sorting.Sort,), {"events": ("conditioning",), "conditioning": fast})
     with pytest.raises(ConfigurationError, match=r"events = .conditioning. .*names other than"):
-        tpm_gym.TPMEnv(wrong).reset()
+        tpm_gym.TPMEnv(wrong)
 
 
 def test_where_there_is_no_room_sampling_says_so(sorting):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from gymnasium import spaces
@@ -34,6 +34,19 @@ __all__ = [
 
 OBSERVATION_BOUND = 10.0
 GOAL_BOUND = 2.0
+
+INFO: Final = {
+    "is_success": bool,
+    "closure_error": float,
+    "vacuum": float,
+    "conditioning": float,
+    "singularity_penalty": float,
+    "assembly_mode_changed": bool,
+    "working_mode_changed": bool,
+    "object_lost": bool,
+    "reward_terms": dict,
+}
+"""Types of the entries of every info by name; the task's events are further entries."""
 
 Observation = dict[str, Any]  # arrays of float32
 Report = tuple[Observation, FloatArray, dict[str, Any]]
@@ -100,6 +113,11 @@ class Core:
             task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
         )
         checking.check(self.task)
+        known = [*INFO]
+        for event in self.task.events:
+            if event in known:
+                raise ConfigurationError("events", event, f"names other than {', '.join(known)}")
+            known.append(event)
         if control not in self.task.controls:
             valid = f"{' or '.join(map(repr, self.task.controls))} for {type(self.task).__name__}"
             raise ConfigurationError("control", control, valid)
@@ -269,11 +287,8 @@ class Core:
             "working_mode_changed": state.working_mode_changed,
             "object_lost": task.lost(state),
             "reward_terms": terms,
+            **{event: getattr(task, event)(state) for event in task.events},
         }
-        for event in task.events:
-            if event in info:
-                raise ConfigurationError("events", event, f"names other than {', '.join(info)}")
-            info[event] = getattr(task, event)(state)
         return observation, reward, info
 
     def _noise(self, rows: IntArray) -> FloatArray:

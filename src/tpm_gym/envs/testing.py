@@ -31,6 +31,7 @@ from gymnasium.utils.env_checker import check_env as check_by_gymnasium
 from numpy.typing import NDArray
 
 from tpm_gym.arrays import brief
+from tpm_gym.envs.core import INFO
 from tpm_gym.errors import (
     ActionError,
     ConfigurationError,
@@ -49,18 +50,6 @@ Env = gym.Env[Any, Any]
 Make = Callable[[], Env]
 Step = tuple[dict[str, Any], float, dict[str, Any]]
 """Observation, reward and info."""
-
-_INFO = {
-    "is_success": bool,
-    "closure_error": float,
-    "vacuum": float,
-    "conditioning": float,
-    "singularity_penalty": float,
-    "assembly_mode_changed": bool,
-    "working_mode_changed": bool,
-    "object_lost": bool,
-    "reward_terms": dict,
-}
 
 
 def check_env(make: Make) -> None:
@@ -165,8 +154,8 @@ def gives_observations_of_order_one_and_plain_infos(make: Make) -> None:
             inside = env.observation_space.contains(observation)
             _require("observations are in the space", inside, str(observation))
             # Wrappers add entries; rl_zoo3 even patches Gymnasium's own TimeLimit.
-            kinds = {name: type(info.get(name)) for name in _INFO}
-            _require(f"info has the types {_INFO}", kinds == _INFO, str(kinds))
+            kinds = {name: type(info.get(name)) for name in INFO}
+            _require(f"info has the types {INFO}", kinds == INFO, str(kinds))
             terms = info["reward_terms"]
             plain = all(type(term) is float for term in terms.values())
             _require("reward terms are floats", plain, str(terms))
