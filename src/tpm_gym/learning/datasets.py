@@ -298,7 +298,6 @@ def _write(dataset: Dataset, scores: tuple[float, float], console: Console) -> s
 
 def _metadata(dataset: Dataset, scores: tuple[float, float], found: str) -> dict[str, Any]:
     config = dataset.config
-    version = tpm_gym.__version__
     about = {
         "expert": "The scripted expert.",
         "noisy": f"The scripted expert with normal noise of {config.noise:g} on its actions.",
@@ -311,7 +310,7 @@ def _metadata(dataset: Dataset, scores: tuple[float, float], found: str) -> dict
         "author": {"The tpm_gym developers"},
         "description": about[dataset.kind],
         "minari_version": provenance.version("minari"),
-        "requirements": [f"tpm-gym=={version}"],
+        "requirements": [f"tpm-gym=={tpm_gym.__version__}"],
         "ref_min_score": scores[0],
         "ref_max_score": scores[1],
         "num_episodes_average_score": REFERENCE,

@@ -24,13 +24,14 @@ def import_module_of(env_id: str) -> None:
     any code when it is imported.
     """
     module = env_id.rpartition(":")[0]
-    if module and (folder := os.getcwd()) not in sys.path:
+    if not module:
+        return
+    if (folder := os.getcwd()) not in sys.path:
         # Workers import the module too, and they take over sys.path. The folder is the last entry,
         # so that its files hide no installed module.
         sys.path.append(folder)
     try:
-        if module:
-            importlib.import_module(module)
+        importlib.import_module(module)
     except Exception as error:  # whatever a user's module may raise
         reason = f"{type(error).__name__}: {error}"
         where = "run the command in the folder that holds it, or install it"

@@ -102,9 +102,9 @@ class Result:
     wall_seconds: float
 
     @property
-    def events(self) -> list[str]:
-        """Names of the metrics of the task's events."""
-        return [*self.records[0].events]
+    def events(self) -> dict[str, str]:
+        """Labels of the metrics of the task's events, by name."""
+        return {name: name.replace("_", " ") for name in self.records[0].events}
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain data, the metrics at its top level."""
@@ -238,7 +238,7 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     table.add_column("metric", no_wrap=True)
     for result in results:
         table.add_column(result.policy, justify="right", overflow="fold")
-    events = [(name.replace("_", " "), name, *_SHARE) for name in results[0].events]
+    events = [(label, name, *_SHARE) for name, label in results[0].events.items()]
     for label, name, factor, form, unit in (*_SUCCESS, *events, *_ROWS):
 
         def show(value: float, form: str = form, factor: float = factor) -> str:

@@ -282,9 +282,8 @@ class _Session:
                 json=config.run / TESTS / f"{engine}.json",
             )
             (result,) = evaluate(test, Console(quiet=True))
-            for name in ("success_at_end", *result.events):
+            for name, label in {"success_at_end": "success", **result.events}.items():
                 rate = result.metrics[name]
-                label = "success" if name == "success_at_end" else name.replace("_", " ")
                 shown = f"{rate.mean:.1%} [{rate.low:.1%}, {rate.high:.1%}]"
                 rates.setdefault(label, []).append(shown)
         for label, each in rates.items():
