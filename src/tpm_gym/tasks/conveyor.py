@@ -125,20 +125,9 @@ class Conveyor(Task):
     def observed(self) -> tuple[Entry, ...]:
         """Return the entries of the robot, of each block, and of the belt."""
         middle, half = sum(SPEEDS) / 2, (SPEEDS[1] - SPEEDS[0]) / 2
-        speed = Entry(
-            "belt_speed",
-            "m/s",
-            "speed of the belt, by its encoder",
-            (middle,),
-            (half,),
-            _belt_speed,
-        )
-        blocks = chain(*(self.object_entries(k) for k in range(len(self.scene.objects))))
-        return (*self.robot_entries(), *blocks, speed)
-
-    def achieved(self, state: State) -> FloatArray:
-        """Return the centres of the blocks."""
-        return state.object_position.reshape(-1, self.goal_size)
+        meaning = "speed of the belt, by its encoder"
+        speed = Entry("belt_speed", "m/s", meaning, (middle,), (half,), _belt_speed)
+        return (*super().observed(), speed)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only."""

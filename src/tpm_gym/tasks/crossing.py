@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -39,18 +39,12 @@ class Crossing(Task):
     controls = ("cartesian",)
     events = ("crossed",)
 
-    def __init__(
-        self,
-        machine: Machine,
-        reward: str = "sparse",
-        goals: str = "sampled",
-        penalty_weight: float = 1.0,
-    ) -> None:
-        """Check the options, and that the machine can pass the plane."""
+    def __init__(self, machine: Machine, *args: Any, **options: Any) -> None:
+        """Check that the machine can pass the plane; see the base class."""
         both = both_sides(machine)
         self._axis = both.mirror_axis
         self.scene = replace(type(self).scene, patches=(_stripe(both),))
-        super().__init__(both, reward, goals, penalty_weight)
+        super().__init__(both, *args, **options)
 
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -73,14 +73,8 @@ class Cycle(Task):
     control_period = 0.004
     max_episode_steps = 75
 
-    def __init__(
-        self,
-        machine: Machine,
-        reward: str = "sparse",
-        goals: str = "sampled",
-        penalty_weight: float = 1.0,
-    ) -> None:
-        """Check the options, and that the way fits into the machine's region."""
+    def __init__(self, machine: Machine, *args: Any, **options: Any) -> None:
+        """Check that the way fits into the machine's region; see the base class."""
         low, high = machine.region.low, machine.region.high
         self._ends = (low[0] + high[0]) / 2 + STROKE / 2 * np.array([-1.0, 1.0])
         self._level = machine.home[2]
@@ -98,7 +92,7 @@ class Cycle(Task):
         if abs(added - quick.payload) > 1e-9:
             valid = "one whose mechanism contains its payload (tpm_gym.mechanism.parts.load)"
             raise ConfigurationError("machine", machine.name, valid)
-        super().__init__(quick, reward, goals, penalty_weight)
+        super().__init__(quick, *args, **options)
         self._peak = np.array([motor.effort for motor in quick.mechanism.motors])
         limits = self._strength()
         self.accelerations = tuple(limits.tolist()), tuple((limits * np.array(BRAKING)).tolist())
