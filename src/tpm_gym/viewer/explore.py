@@ -42,7 +42,7 @@ class Explore:
         """Add the controls."""
         self._server, self._worker, self._show = server, worker, show
         self.posture: Posture
-        self.gizmo: TransformControlsHandle | None = None
+        self.gizmo: TransformControlsHandle
         self._add_modes(server.gui)
         self._add_motors(server.gui)
         # Last in the panel, so that a message that appears moves no control.
@@ -123,7 +123,7 @@ class Explore:
 
     def hide_gizmo(self, hidden: bool) -> None:
         """Hide the gizmo, which covers the cup, or show it again."""
-        if self.gizmo is not None and self.gizmo.visible == hidden:
+        if self.gizmo.visible == hidden:
             self.gizmo.visible = not hidden
 
     def go_home(self) -> None:
@@ -136,8 +136,7 @@ class Explore:
         # All messages at once: each wakes the thread that sends them.
         with self._server.atomic():
             self._set_panel(posture)
-            if self.gizmo is not None:
-                self.gizmo.position = posture.position
+            self.gizmo.position = posture.position
             self._show(posture)
 
     def _set_panel(self, posture: Posture) -> None:
@@ -181,7 +180,6 @@ class Explore:
             self.assembly.options = labels
 
     def _point_again(self) -> None:
-        assert self.gizmo is not None
         self.drag(self.gizmo.position)
 
     def _joints_again(self) -> None:

@@ -38,11 +38,8 @@ def colour(rgba: Sequence[float]) -> tuple[int, int, int]:
 
 def set_camera(server: ViserServer, machine: Machine) -> None:
     """Place the camera of new pages, so that the robot fills the picture."""
-    middle = machine.mount.to_world(machine.home) * [1, 0.5, 0] + [
-        0,
-        0,
-        0.55 * machine.mount.height,
-    ]
+    middle = machine.mount.to_world(machine.home) * [1, 0.5, 0]
+    middle[2] = 0.55 * machine.mount.height
     server.initial_camera.look_at = middle
     # The camera's distance was chosen for the paper's machine.
     longer = max(machine.table) - max(PAPER_TPM.table)
