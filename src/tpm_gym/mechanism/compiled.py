@@ -138,7 +138,7 @@ class CompiledMachine(Machine):
 
     @property
     def lengths(self) -> tuple[float, ...]:
-        """All lengths of the geometry, m."""
+        """Lengths of the geometry, m."""
         return tuple(self.geometry.lengths)
 
     def with_lengths(self, lengths: tuple[float, ...]) -> CompiledMachine:
