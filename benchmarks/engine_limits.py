@@ -1,11 +1,11 @@
-"""Success of the published policy in each engine, at two time steps, with noise on its actions.
+"""Success of a policy in each engine, at several time steps, with noise on its actions.
 
-    python benchmarks/engine_limits.py
+    python benchmarks/engine_limits.py [--policy FILE]
 
 Each engine acts on its own observations. Noise makes the policy drop, throw and shove, so that
 success depends on contact. Engines agree if their numbers do, and a time step is short enough if a
-shorter one gives the same numbers. Results go to docs/records/limits.json, and from there to
-docs/analytic-engine.md.
+shorter one gives the same numbers. Results of the published policy go to docs/records/limits.json,
+and from there to docs/analytic-engine.md; those of a file are printed.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 from shared import ROOT, describe, fill, provenance, read_record, table
 
+import tpm_gym
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import NoisyPolicy, load_policy
@@ -33,21 +34,33 @@ MILLISECONDS = (4, 1)
 NOISES = (0.0, 0.3, 0.8)
 """Standard deviations of the noise, in units of the largest action."""
 
-Cell = tuple[float, str, int, int]
+BATCH = 250
+"""Number of episodes that the analytic engine runs at a time."""
+
+
+class Cell(NamedTuple):
+    """One noise in one engine at one time step."""
+
+    noise: float
+    engine: str
+    milliseconds: float
+    episodes: int
+    policy: str = ENV_ID
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Test one noise in one engine at one time step."""
-    noise, engine, milliseconds, count = cell
-    physics = {"time_step": milliseconds / 1000}
-    with closing(make_envs(ENV_ID, 1, engine=engine, physics=physics)) as envs:
-        policy = NoisyPolicy(load_policy(ENV_ID, envs), noise)
-        episodes = run_episodes(envs, policy, count, TEST_SEED)
+    """Test a policy, given by the id of a published one or by its file."""
+    about = tpm_gym.load_policy(cell.policy).about
+    physics = {"time_step": cell.milliseconds / 1000}
+    count = BATCH if cell.engine == "analytic" else 1
+    with closing(make_envs(about.env_id, count, engine=cell.engine, physics=physics)) as envs:
+        policy = NoisyPolicy(load_policy(cell.policy, envs), cell.noise)
+        episodes = run_episodes(envs, policy, cell.episodes, TEST_SEED)
     successes = [episode.success_at_end for episode in episodes]
     return {
-        "noise": noise,
-        "engine": engine,
-        "milliseconds": milliseconds,
+        "noise": cell.noise,
+        "engine": cell.engine,
+        "milliseconds": cell.milliseconds,
         "success": wilson(successes).as_dict(),
     }
 
@@ -66,7 +79,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
         (cell["noise"], cell["engine"], cell["milliseconds"]): cell["success"]
         for cell in record["cells"]
     }
-    columns = list(product(ENGINES, MILLISECONDS))
+    noises, engines, steps = (list(dict.fromkeys(values)) for values in zip(*found, strict=True))
+    columns = list(product(engines, steps))
     widest = max((cell["high"] - cell["low"]) / 2 for cell in found.values())
     yield (
         f"`{record['machine']['command']}`: {record['episodes']} episodes a cell, 95% intervals of "
@@ -74,10 +88,10 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     )
     yield ""
     yield from table(
-        ["noise", *(f"{ENGINES[engine]}, {step} ms" for engine, step in columns)],
+        ["noise", *(f"{ENGINES[engine]}, {step:g} ms" for engine, step in columns)],
         [
             [f"{noise:g}", *(f"{found[(noise, *column)]['mean']:.1%}" for column in columns)]
-            for noise in NOISES
+            for noise in noises
         ],
     )
 
@@ -85,12 +99,15 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
 def main() -> None:
     """Parse the options, measure, write the record and fill the page."""
     parser = argparse.ArgumentParser(description="Success at two time steps, in each engine.")
-    parser.add_argument("--episodes", type=int, default=400)
+    parser.add_argument("--policy", default=ENV_ID, help="id of a published policy, or a file")
+    parser.add_argument("--milliseconds", type=float, nargs="+", default=MILLISECONDS)
+    parser.add_argument("--noises", type=float, nargs="+", default=NOISES)
+    parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
     todo = [
-        (noise, engine, step, options.episodes)
-        for noise, engine, step in product(NOISES, ENGINES, MILLISECONDS)
+        Cell(noise, engine, step, options.episodes, options.policy)
+        for noise, engine, step in product(options.noises, ENGINES, options.milliseconds)
     ]
     found = []
     with ProcessPoolExecutor(options.jobs) as pool:
@@ -99,8 +116,9 @@ def main() -> None:
             found.append(cell)
     record = {"machine": describe(sys.argv), "episodes": options.episodes, "cells": found}
     print("\n".join(lines(record)))
-    provenance.write_json(RECORD, record)
-    publish()
+    if options.policy == ENV_ID:
+        provenance.write_json(RECORD, record)
+        publish()
 
 
 if __name__ == "__main__":

@@ -25,8 +25,8 @@ modes = st.sampled_from(WORKING_MODES)
 
 def signs(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
     """Return signs (..., 4) of parallel factors and elevation by the oracle, or NaN."""
-    elevation = oracle.elevation_at(points, mode, g)[..., None]
-    return np.sign(np.concatenate([oracle.factors_at(points, mode, g)[0], elevation], axis=-1))
+    parallel, _, elevation = oracle.factors_at(points, mode, g)
+    return np.sign(np.concatenate([parallel, elevation[..., None]], axis=-1))
 
 
 def of(aspect: Aspect) -> list[int]:

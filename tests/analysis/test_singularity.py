@@ -1,5 +1,7 @@
 """Singularities agree with the oracle's factors, and their distances with brute force."""
 
+import math
+
 import numpy as np
 import oracle
 import pytest
@@ -30,8 +32,8 @@ SIDES = [AssemblyMode(planar, 1) for planar in (-1, 1)]
 def oracle_factors(points: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
     """Return dimensionless factors (..., 8) by the oracle; NaN where not reachable."""
     sizes = np.array([1, g.l4, g.l4**2, 1, g.l3 * g.l4, g.l3 * g.l4, g.l3 * g.l4, g.l4])
-    elevation = oracle.elevation_at(points, mode, g)[..., None]
-    return np.concatenate([*oracle.factors_at(points, mode, g), elevation], axis=-1) / sizes
+    *factors, elevation = oracle.factors_at(points, mode, g)
+    return np.concatenate([*factors, elevation[..., None]], axis=-1) / sizes
 
 
 def rays(count: int, seed: int) -> FloatArray:
@@ -42,9 +44,13 @@ def rays(count: int, seed: int) -> FloatArray:
 def ball_is_clear(
     point: FloatArray, radius: float, mode: WorkingMode, g: Geometry, count: int
 ) -> bool:
-    """Return whether no sign changes within 0.999 of the radius, along rays, by the oracle."""
+    """Return whether no sign changes within 0.999 of the radius, by the oracle.
+
+    Points are as dense on the inner spheres as on the outer ones: ``count`` on the largest.
+    """
     steps = np.append(np.linspace(0.05, 0.95, 19), [0.99, 0.999])
-    ball = point + radius * steps[:, None, None] * rays(count, 1)
+    spheres = [step * rays(math.ceil(step**2 * count), seed) for seed, step in enumerate(steps)]
+    ball = point + radius * np.concatenate(spheres)
     clear = np.sign(oracle_factors(ball, mode, g)) == np.sign(oracle_factors(point, mode, g))
     return bool(clear.all())
 

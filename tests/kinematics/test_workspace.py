@@ -59,7 +59,7 @@ def test_assembly_of_names_the_signs_of_the_parallel_factors():
     seen = set()
     for mode in WORKING_MODES:
         here = points[workspace.reachable(points, mode)]
-        parallel, _ = oracle.factors_at(here, mode, PAPER)
+        parallel, *_ = oracle.factors_at(here, mode, PAPER)
         slots = workspace.assembly_of(here, mode)
         np.testing.assert_array_equal(slots, oracle.assembly_slots(parallel))
         seen |= set(slots.tolist())

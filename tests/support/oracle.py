@@ -121,18 +121,12 @@ def link3(position: FloatArray, beta: Any, g: Lengths) -> tuple[FloatArray, Floa
 
 def factors_at(
     position: FloatArray, mode: WorkingMode, g: Geometry
-) -> tuple[FloatArray, FloatArray]:
-    """The same at points (..., 3) on a working mode; NaN where not reachable."""
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same at points (..., 3) on a working mode, and z_C1 - z_B1 (...,) m; NaN out of reach."""
     found = inverse_all(position, g)
     theta, beta = found.theta[..., mode.index, :], found.beta[..., mode.index]
-    return factors(theta, *link3(position, beta, g), beta, g)
-
-
-def elevation_at(position: FloatArray, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """z_C1 - z_B1 at points (..., 3) on a working mode, (...,) m; NaN where not reachable."""
-    theta = inverse_all(position, g).theta[..., mode.index, :]
-    rise: FloatArray = position[..., 2] - 2 * g.l6 - g.l3 * np.sin(theta[..., 0])
-    return rise
+    elevation = position[..., 2] - 2 * g.l6 - g.l3 * np.sin(theta[..., 0])
+    return *factors(theta, *link3(position, beta, g), beta, g), elevation
 
 
 def level_rod_4(

@@ -1,5 +1,6 @@
 """The scripted controller solves every task on every machine, and says when it cannot."""
 
+import math
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -34,18 +35,23 @@ def solved(env: Any, **options: Any) -> bool:
     return bool(info["is_success"])
 
 
+def how_many(env_id: str, options: dict[str, str]) -> int:
+    """Episodes of a slow test."""
+    if "Cycle" in env_id and options.get("machine") == "gantry":
+        return 100  # the base class computes its torques, which takes milliseconds each
+    return 200 if "Joints" in env_id else 500  # joints follow the same paths by other actions
+
+
 @pytest.mark.parametrize("options", PLACES, ids=str)
 @pytest.mark.parametrize("env_id", SPARSE)
-@pytest.mark.parametrize(
-    ("episodes", "wanted"), [(3, 3), pytest.param(500, 495, marks=pytest.mark.slow)]
-)
-def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(
-    env_id, options, episodes, wanted
-):
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_it_solves_every_task_clear_of_the_singularity_with_half_the_torque(env_id, options, many):
     if "Crossing" in env_id:
         pytest.skip("passes the singularity: see test_crossing.py")
     if re.search("Push|Throw|Conveyor|Cycle", env_id) and options.get("engine") == "kinematic":
         pytest.skip("needs contact, a belt, motion of what is let go, or short time steps")
+    episodes = how_many(env_id, options) if many else 3
+    wanted = math.ceil(0.99 * episodes)
     env = gym.make(env_id, **options)
     machine, successes, clear = env.unwrapped.machine, 0, 0
     share = 1.0 if "Cycle" in env_id else 0.5

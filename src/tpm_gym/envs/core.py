@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, is_dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from gymnasium import spaces
@@ -23,6 +23,9 @@ from tpm_gym.tasks import checking
 from tpm_gym.tasks.control import Follower, make_control
 from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
+
+if TYPE_CHECKING:
+    from tpm_gym.envs.shield import Shield
 
 __all__ = [
     "Core",
@@ -112,12 +115,7 @@ class Core:
         self.task = make_task(
             task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
         )
-        checking.check(self.task)
-        known = [*INFO]
-        for event in self.task.events:
-            if event in known:
-                raise ConfigurationError("events", event, f"names other than {', '.join(known)}")
-            known.append(event)
+        checking.check(self.task, taken=tuple(INFO))
         if control not in self.task.controls:
             valid = f"{' or '.join(map(repr, self.task.controls))} for {type(self.task).__name__}"
             raise ConfigurationError("control", control, valid)
@@ -125,12 +123,7 @@ class Core:
         self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._altered = self.randomisation != Randomisation()
-        self._shield = None
-        if shield is not False:
-            from tpm_gym.envs.shield import make_shield  # imports Numba
-
-            exact = self.drive is None and not self._altered
-            self._shield = make_shield(shield, self.machine, self.control, exact)
+        self._shield = None if shield is False else self._make_shield(shield)
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
         self._pixels: Pixels | None = None
         if observations == "pixels":
@@ -139,23 +132,18 @@ class Core:
             raise ConfigurationError("observations", observations, "'state' or 'pixels'")
         gui = render_mode == "human"
         self._engine = {"engine": engine, "physics": physics, "gui": gui, "renderer": renderer}
-        # As a dictionary, like in a spec that went through JSON.
-        settings = is_dataclass(physics) and not isinstance(physics, type)
         self.kind = {
             "task": type(self.task),
             "machine": self.machine,
             "engine": engine,
             "drive": self.drive,
             "randomisation": self.randomisation,
-            "physics": asdict(physics) if settings else physics,
+            "physics": _as_in_json(physics),
             "shield": shield,
             "number of environments": count,
             "observations": observations,
         }
-        self._follower: Follower | None = None
-        if self.task.accelerations is not None:
-            period = self.task.control_period
-            self._follower = Follower(self.machine, *self.task.accelerations, period)
+        self._follower = self._make_follower()
         self._home = self.machine.require_inverse(np.array(self.machine.home))
         self._state: State | None = None
         self.closed = False
@@ -166,6 +154,17 @@ class Core:
         # Objects in the last control steps, oldest first, if the camera is late
         self._views = np.zeros((self.task.camera_delay, count, len(self.task.scene.objects), 9))
         self.simulation = self._start()
+
+    def _make_shield(self, shield: bool | float) -> Shield:
+        from tpm_gym.envs.shield import make_shield  # imports Numba
+
+        exact = self.drive is None and not self._altered
+        return make_shield(shield, self.machine, self.control, exact)
+
+    def _make_follower(self) -> Follower | None:
+        if self.task.accelerations is None:
+            return None
+        return Follower(self.machine, *self.task.accelerations, self.task.control_period)
 
     def _start(self) -> Simulation:
         return Simulation(
@@ -419,6 +418,12 @@ class Core:
             self.simulation.close()
         elif snapshot is not None:
             self.simulation.restore(snapshot)
+
+
+def _as_in_json(physics: Any) -> Any:
+    """Return physics as a dictionary, like in a spec that went through JSON."""
+    settings = is_dataclass(physics) and not isinstance(physics, type)
+    return asdict(physics) if settings else physics
 
 
 def _view(state: State) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,16 +20,25 @@ _EXAMPLES = 7
 """States with which a task is checked; no other size is 7, so that axes cannot be confused."""
 
 
-def check(task: Task) -> None:
+def check(task: Task, taken: Sequence[str] = ()) -> None:
     """Check that a task has starts, and equal results for states together and one by one.
 
     Not every machine has tempting goals, or room for a task. And a method that reduces over the
     robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns, gives wrong
     rewards in vector environments without an error.
 
+    Args:
+        taken: Names that no event may have.
+
     Raises:
-        ConfigurationError: If there is no start, or a result is wrong; the error names the method.
+        ConfigurationError: If there is no start, an event's name is taken, or a result is wrong;
+            the error names the method.
     """
+    known = list(taken)
+    for event in task.events:
+        if event in known:
+            raise ConfigurationError("events", event, f"names other than {', '.join(known)}")
+        known.append(event)
     task.start([np.random.default_rng(0)])
     several = _example_states(task.machine, task.scene)
     _check_shapes(task, several)
