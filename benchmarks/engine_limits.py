@@ -20,10 +20,9 @@ from typing import Any, NamedTuple
 
 from shared import ROOT, describe, fill, provenance, read_record, table
 
-import tpm_gym
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
-from tpm_gym.learning.policies import NoisyPolicy, load_policy
+from tpm_gym.learning.policies import NoisyPolicy, load_policy, trained_in
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
 
 RECORD = ROOT / "docs" / "records" / "limits.json"
@@ -49,11 +48,11 @@ class Cell(NamedTuple):
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Test a policy, given by the id of a published one or by its file."""
-    about = tpm_gym.load_policy(cell.policy).about
+    """Test a policy, given by the id of a published one, or by its file."""
+    env_id, _ = trained_in(cell.policy) or (ENV_ID, {})
     physics = {"time_step": cell.milliseconds / 1000}
     count = BATCH if cell.engine == "analytic" else 1
-    with closing(make_envs(about.env_id, count, engine=cell.engine, physics=physics)) as envs:
+    with closing(make_envs(env_id, count, engine=cell.engine, physics=physics)) as envs:
         policy = NoisyPolicy(load_policy(cell.policy, envs), cell.noise)
         episodes = run_episodes(envs, policy, cell.episodes, TEST_SEED)
     successes = [episode.success_at_end for episode in episodes]

@@ -148,7 +148,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | after a reset with that option: the episode's plant |
 
-    Crossing adds ``crossed``: whether P is beyond y = 0, as the task asks.
+    Crossing adds ``crossed``: whether P is beyond y = 0, as the task asks. Push adds ``toppled``:
+    whether the block lies on a side.
 
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
@@ -30,6 +31,8 @@ SIDEWAYS: Final = 0.15
 """Largest slope of the expert's pushing direction against the normal of the face."""
 CLOSE: Final = 0.001
 """Remaining way at which the expert stops, m."""
+UPRIGHT: Final = math.cos(math.radians(45))
+"""Smallest z of the axis of a block that stands."""
 
 _ATTEMPTS: Final = 1000
 _DRAWS: Final = 8
@@ -46,6 +49,7 @@ class Push(Task):
     block = Block(height=0.040)
     scene = Scene(objects=(block,))
     samplings = ("sampled", "tempting")
+    events = ("toppled",)
 
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
@@ -112,6 +116,11 @@ class Push(Task):
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), state.object_position[:, 0]))}
+
+    def toppled(self, state: State) -> BoolArray:
+        """Return whether the block lies on a side, (n,)."""
+        fallen: BoolArray = state.object_axis[:, 0, 2] < UPRIGHT
+        return fallen
 
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Come down behind the block, push it to the goal, and stay."""

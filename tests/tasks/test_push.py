@@ -1,0 +1,41 @@
+"""Push: the block stays on its base when it is pushed low, and topples when it is struck high."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from episodes import expert_episode
+
+from tpm_gym.mechanism.cup import CUP
+
+START = {"object": (0.0, -0.03, 0.02), "goal": (0.1, -0.033, 0.02)}
+
+
+def struck(engine: str, height: float) -> tuple[list[bool], list[float]]:
+    """``toppled`` in every step, and the z of the block's axis, where the lip hits at full speed."""
+    env = gym.make("TPMPush-v0", engine=engine)
+    env.reset(seed=0, options=START)
+    inner, toppled, upright = env.unwrapped, [], []
+    behind = np.array([-0.09, -0.03, height + CUP.length])
+    for wanted in [behind] * 12 + [behind + (0.12, 0.0, 0.0)] * 14:
+        place, current = (inner.machine.mount.to_paper(p) for p in (wanted, inner.state.command))
+        action = inner.control.action(place[None], current[None])[0]
+        *_, info = env.step(action)
+        toppled.append(bool(info["toppled"]))
+        upright.append(float(inner.state.object_axis[0, 2]))
+    return toppled, upright
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
+def test_a_block_that_is_struck_high_topples_and_info_says_so(engine):
+    for height, falls in ((0.006, False), (0.036, True)):
+        toppled, upright = struck(engine, height)
+        assert toppled == [z < np.sqrt(0.5) for z in upright]
+        assert not toppled[0]
+        assert toppled[-1] == falls
+        assert (upright[-1] < 0.1) == falls
+
+
+def test_the_expert_topples_no_block():
+    env = gym.make("TPMPush-v0", engine="analytic")
+    for seed in range(20):
+        assert not any(info["toppled"] for *_, info in expert_episode(env, seed))
