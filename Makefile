@@ -150,7 +150,7 @@ bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Rob
 
 soak: $(INSTALLED) ## a million steps over all ids in PyBullet, and in MuJoCo: memory, loop gaps, speed; an hour
 	$(RUN) benchmarks/soak.py --json runs/soak.json --plot runs/soak.png
-	$(RUN) benchmarks/soak.py --engine mujoco --json runs/soak_mujoco.json --plot runs/soak_mujoco.png
+	$(RUN) benchmarks/soak.py --engine mujoco --warm-up 250000 --json runs/soak_mujoco.json --plot runs/soak_mujoco.png
 
 clean: ## remove the environment and everything generated
 	rm -rf $(VENV) runs dist build docs/generated .pytest_cache .mypy_cache .ruff_cache .hypothesis

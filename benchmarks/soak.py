@@ -1,7 +1,7 @@
 """Run the environments for a million steps, and measure memory, loop gaps and speed.
 
     make soak
-    python benchmarks/soak.py --engine mujoco
+    python benchmarks/soak.py --engine mujoco --warm-up 250000
 
 Ids take turns. Each visit has one to three episodes, which depend on (seed, number of the visit)
 alone. There are resets with and without seeds, with options, in the middle of an episode and at its
@@ -11,7 +11,8 @@ made anew. An exception is recorded and does not end the run: ``--replay VISIT``
 
 Memory is compared with the first sample after the warm-up. By then each id has been opened and has
 drawn a picture (each new environment draws one), and caches are full. Before each sample, garbage
-is collected and the C library returns free memory; this time does not count.
+is collected and the C library returns free memory; this time does not count. Mesa, which draws for
+MuJoCo without a GPU, takes more until some 50 environments were made anew: give it ``--warm-up``.
 """
 
 from __future__ import annotations

@@ -99,6 +99,24 @@ def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:
         assert found == pytest.approx(solid.size[:2], **DIGITS)
 
 
+def length_of(cylinder: ElementTree.Element) -> float:
+    return float(child(cylinder, "geometry/cylinder").get("length"))
+
+
+def assert_filled(shapes: list[ElementTree.Element], solid: Any) -> None:
+    """The shapes are the cylinder cut across: two thin ends, and the flank between."""
+    along = turned(solid.rpy)[:, "xyz".index(solid.axis)]
+    place = -solid.size[1] / 2
+    for shape in shapes:
+        radius, length = float(child(shape, "geometry/cylinder").get("radius")), length_of(shape)
+        centre = np.array(solid.centre) + (place + length / 2) * along
+        assert_same_solid(shape, replace(solid, size=(radius, length, 0.0), centre=tuple(centre)))
+        assert radius == solid.size[0]
+        place += length
+    assert place == pytest.approx(solid.size[1] / 2)
+    assert max(length_of(shapes[0]), length_of(shapes[2])) < 0.2 * solid.size[1]
+
+
 def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism):
     root, used = parsed(mechanism), set()
     for element, link in zip(root.findall("link"), mechanism.links, strict=True):
@@ -108,8 +126,13 @@ def test_solids_are_drawn_as_they_are_and_collide_where_they_should(mechanism):
             assert material == solid.colour
             used.add(material)
         colliding = [solid for solid in link.solids if solid.collides]
-        for collision, solid in zip(element.findall("collision"), colliding, strict=True):
-            assert_same_solid(collision, solid)
+        shapes = iter(element.findall("collision"))
+        for solid in colliding:
+            if solid.kind == "box":
+                assert_same_solid(next(shapes), solid)
+            else:
+                assert_filled([next(shapes) for _ in range(3)], solid)
+        assert not list(shapes)
     assert used <= set(COLOURS)
     found = {
         material.get("name"): tuple(numbers(child(material, "color").get("rgba")))

@@ -39,3 +39,25 @@ print(memory() - before)
 def test_200_environments_and_copies_are_given_back(options, megabytes):
     said = printed_by(PYTHON, "-c", SCRIPT.replace("{options}", options))
     assert float(said.split()[-1]) < megabytes
+
+
+OPEN = """
+import os
+import gymnasium as gym, tpm_gym
+def memory():
+    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+def opened():
+    env = gym.make("TPMPickAndPlace-v0", engine="mujoco", render_mode="rgb_array", width=64, height=48)
+    env.reset(seed=0)
+    env.render()
+    return env
+envs = [opened()]
+before = memory()
+envs += [opened() for _ in range(6)]
+print((memory() - before) / 6)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs Linux")
+def test_an_environment_that_draws_small_pictures_in_mujoco_takes_little_memory():
+    assert float(printed_by(PYTHON, "-c", OPEN).split()[-1]) < 40  # 13; 77 with a map for shadows

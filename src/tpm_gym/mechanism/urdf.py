@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
+from typing import Final
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 from tpm_gym.arrays import Vector
@@ -39,6 +41,13 @@ COLOURS = {
     "violet": (0.46, 0.25, 0.72, 1.0),
     "red": (0.83, 0.18, 0.33, 1.0),
 }
+
+_END: Final = 0.002
+"""Height of the ends of a cylinder that are collision shapes of their own, m.
+
+PyBullet finds one new contact of two shapes in a time step, anywhere on the height of an upright
+cylinder that hits a wall. So a lip that hit a block low could strike it at its upper edge.
+"""
 
 _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
 
@@ -126,7 +135,21 @@ def _add_link(root: Element, link: Link) -> None:
     for solid in link.solids:
         add(_add_solid(element, "visual", solid), "material", name=solid.colour)
         if solid.collides:
-            _add_solid(element, "collision", solid)
+            for shape in _collision_shapes(solid):
+                _add_solid(element, "collision", shape)
+
+
+def _collision_shapes(solid: Solid) -> list[Solid]:
+    """Return a box as it is, a cylinder as three: its ends, and the flank between them."""
+    radius, length, _ = solid.size
+    if solid.kind == "box" or length <= 2 * _END:
+        return [solid]
+    along, away = solid.rotation[:, 2], (length - _END) / 2
+    parts = []
+    for place, height in ((-away, _END), (0.0, length - 2 * _END), (away, _END)):
+        x, y, z = (solid.centre + place * along).tolist()
+        parts.append(replace(solid, size=(radius, height, 0.0), centre=(x, y, z)))
+    return parts
 
 
 def _add_solid(link: Element, tag: str, solid: Solid) -> Element:

@@ -90,6 +90,7 @@ class Pictures:
         screen.offwidth, screen.offheight = width, height
         # Smooth edges take three quarters of the time. Small pictures are observations.
         model.vis.quality.offsamples = 4 if width * height > _SMALL else 0
+        model.vis.quality.shadowsize = 0  # a map for shadows, which no light casts, takes 64 MiB
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR.value
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
