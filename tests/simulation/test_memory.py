@@ -47,7 +47,8 @@ import gymnasium as gym, tpm_gym
 def memory():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 def opened():
-    env = gym.make("TPMPickAndPlace-v0", engine="mujoco", render_mode="rgb_array", width=64, height=48)
+    size = {"width": 64, "height": 48}
+    env = gym.make("TPMPickAndPlace-v0", engine="mujoco", render_mode="rgb_array", **size)
     env.reset(seed=0)
     env.render()
     return env
