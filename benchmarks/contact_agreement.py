@@ -3,8 +3,10 @@
     python benchmarks/contact_agreement.py [--cases 100]
 
 Two blocks are let go on each other, pushed over, pushed side by side, dragged and put down. Rest
-poses are compared with those of MuJoCo at 0.5 ms, and MuJoCo's own with those at 0.25 ms. How often
-a policy succeeds in each engine is measured by ``engine_limits.py``.
+poses are compared with those of MuJoCo at 0.5 ms, and MuJoCo's own with those at 0.25 ms. A block
+of 40 mm is struck by the lip at full speed, higher each time, until it topples.
+
+How often a policy succeeds in each engine is measured by ``engine_limits.py``.
 """
 
 from __future__ import annotations
@@ -24,14 +26,16 @@ from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import Block, Scene
 
 BLOCKS = Block("lower"), Block("upper")
+TALL = Block("tall", height=0.040)
 WIDTH, HEIGHT = BLOCKS[0].width, BLOCKS[0].height
 MIDDLE = np.array([0.3, -0.36, 0.0])
 KINDS = ("rest", "over", "side", "drag", "put")
+HEIGHTS = (0.027, 0.0275, 0.028, 0.0285, 0.029, 0.0295, 0.030, 0.0305, 0.031, 0.032, 0.033, 0.034)
 TOPPLED = math.radians(45)
 
 
 class Case(NamedTuple):
-    """Centres of two blocks (2, 3) m, commands (t, 3) m for point P, and the vacuum (t,)."""
+    """Centres of k blocks (k, 3) m, commands (t, 3) m for point P, and the vacuum (t,)."""
 
     places: FloatArray
     commands: FloatArray
@@ -39,7 +43,7 @@ class Case(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """Centres (2, 3) m at the end, and the largest tilt (2,) rad of the blocks."""
+    """Centres (k, 3) m at the end, and the largest tilt (k,) rad of the blocks."""
 
     places: FloatArray
     tilt: FloatArray
@@ -114,14 +118,25 @@ def cases(count: int) -> list[Case]:
     return [draw(kind, np.random.default_rng([3, k])) for k, kind in enumerate(kinds)]
 
 
-def play(some: Sequence[Case], engine: str, time_step: float) -> list[Outcome]:
+def strike(height: float) -> Case:
+    """Return a case in which the lip, ``height`` m above the table, hits a block at full speed."""
+    start = MIDDLE + np.array([-0.09, 0.0, height + CUP.length])
+    stop = start + np.array([0.12, 0.0, 0.0])
+    commands = [start, *line(start, stop, 4), *[stop] * 10]
+    place = MIDDLE + np.array([0.0, 0.0, TALL.height / 2])
+    return Case(place[None], np.array(commands), [False] * len(commands))
+
+
+def play(
+    some: Sequence[Case], engine: str, time_step: float, blocks: Sequence[Block] = BLOCKS
+) -> list[Outcome]:
     """Run cases in an engine."""
-    scene, mount, outcomes = Scene(objects=BLOCKS), WIDE_TPM.mount, []
+    scene, mount, outcomes = Scene(objects=tuple(blocks)), WIDE_TPM.mount, []
     physics = {"time_step": time_step}
     with closing(Simulation(scene, engine=engine, machine=WIDE_TPM, physics=physics)) as sim:
         for places, commands, vacuum in some:
-            points, tilt = mount.to_paper(commands), np.zeros(2)
-            start = {block.name: place[None] for block, place in zip(BLOCKS, places, strict=True)}
+            points, tilt = mount.to_paper(commands), np.zeros(len(blocks))
+            start = {block.name: place[None] for block, place in zip(blocks, places, strict=True)}
             sim.reset(np.array([0]), WIDE_TPM.inverse(points[0]), start)
             for point, on in zip(points[1:], vacuum[1:], strict=True):
                 sim.move(point[None], np.array([on]))
@@ -157,11 +172,16 @@ def main() -> None:
     reference = play(some, "mujoco", 0.0005)
     for engine, step in (
         ("mujoco", 0.00025),
+        ("mujoco", 0.004),
+        ("pybullet", 0.004),
         ("pybullet", 0.001),
         ("analytic", 0.004),
         ("analytic", 0.001),
     ):
         print(engine, step, agreement(play(some, engine, step), reference))
+        struck = play([strike(height) for height in HEIGHTS], engine, step, [TALL])
+        lowest = next(h for h, found in zip(HEIGHTS, struck, strict=True) if found.toppled)
+        print(f"  a struck block topples from {1000 * lowest:.1f} mm on")
 
 
 if __name__ == "__main__":
