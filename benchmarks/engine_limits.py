@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from itertools import product
@@ -95,15 +95,20 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     )
 
 
-def main() -> None:
-    """Parse the options, measure, write the record and fill the page."""
+def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Read the command line."""
     parser = argparse.ArgumentParser(description="Success at two time steps, in each engine.")
     parser.add_argument("--policy", default=ENV_ID, help="id of a published policy, or a file")
     parser.add_argument("--milliseconds", type=float, nargs="+", default=MILLISECONDS)
     parser.add_argument("--noises", type=float, nargs="+", default=NOISES)
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=1)
-    options = parser.parse_args()
+    return parser.parse_args(arguments)
+
+
+def main() -> None:
+    """Parse the options, measure, write the record and fill the page."""
+    options = parse()
     todo = [
         Cell(noise, engine, step, options.episodes, options.policy)
         for noise, engine, step in product(options.noises, ENGINES, options.milliseconds)

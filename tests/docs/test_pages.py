@@ -7,6 +7,7 @@ import shlex
 import subprocess
 from pathlib import Path
 
+import engine_limits
 import gymnasium as gym
 import matplotlib
 import pytest
@@ -87,6 +88,8 @@ def understand(words):
             tyro.cli(Command, args=options)
         case ["python", "-m", "benchmarks.studies", *options]:
             tyro.cli(StudiesCommand, args=options)
+        case ["python", "benchmarks/engine_limits.py", *options]:
+            engine_limits.parse(options)
         case ["make", target]:
             command = ["make", "--dry-run", "--directory", str(ROOT), target]
             subprocess.run(command, check=True, capture_output=True)
