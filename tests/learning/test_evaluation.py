@@ -305,7 +305,7 @@ def test_command_line_errors_are_one_line(words, message):
 def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    with pytest.raises(ConfigError, match="--json .*pipe: is a device or a pipe"):
+    with pytest.raises(ConfigError, match=r"--json .*pipe: is a device or a pipe"):
         evaluate(EvaluationConfig(("expert",), "TPMReach-v0", json=pipe), quiet())
     assert pipe.is_fifo()
 
