@@ -140,8 +140,12 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
 
     if not ray.is_initialized():
         # Ray refuses a number of CPUs for a cluster that is there.
-        jobs = None if "RAY_ADDRESS" in os.environ else config.jobs
-        ray.init(num_cpus=jobs, include_dashboard=False, log_to_driver=False)
+        address = os.environ.get("RAY_ADDRESS")
+        jobs = None if address else config.jobs
+        try:
+            ray.init(num_cpus=jobs, include_dashboard=False, log_to_driver=False)
+        except ConnectionError as error:
+            raise ConfigError(f"RAY_ADDRESS {address}: {error}; start Ray there") from error
     sampler, space = TPESampler(seed=config.seed), partial(_suggest, config.algo)
     search = OptunaSearch(space, metric="score", mode="max", sampler=sampler)
     settings = ray_tune.TuneConfig(
