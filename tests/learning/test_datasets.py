@@ -16,7 +16,7 @@ from paths import ROOT
 from trainings import quiet
 
 from tpm_gym.learning.configuration import EnvOptions
-from tpm_gym.learning.datasets import KINDS, CollectConfig, _complete, collect, digest
+from tpm_gym.learning.datasets import KINDS, CollectConfig, Dataset, _complete, collect, digest
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.policies import load_policy
@@ -140,6 +140,13 @@ def test_options_of_the_environment_are_kept_and_named(tmp_path, monkeypatch):
         assert (env.unwrapped.machine.name, env.spec.kwargs["shield"]) == ("wide", True)
 
 
+@pytest.mark.parametrize("engine", ["pybullet", None])  # None: the engine of the id
+def test_datasets_of_two_engines_have_two_names(engine):
+    """The command's engine is analytic, and has no word."""
+    given = replace(config(Path(), "random"), env_options=EnvOptions(engine=engine, machine="wide"))
+    assert Dataset(given, REACH, "random", Path()).name == f"{REACH}/random-pybullet-wide-v0"
+
+
 @pytest.mark.parametrize(
     ("message", "changes"),
     [
@@ -147,6 +154,10 @@ def test_options_of_the_environment_are_kept_and_named(tmp_path, monkeypatch):
         ("--kind best: there are expert, noisy, random, replay", {"kind": ("best",)}),
         ("--episodes 0: must be at least 1", {"episodes": 0}),
         ("--noise -1: must be at least 0", {"noise": -1}),
+        ("--noise nan: must be at least 0", {"noise": float("nan")}),
+        ("--noise inf: must be finite", {"noise": float("inf")}),
+        ("--env: give at least one", {"env": ()}),
+        ("--kind: give at least one", {"kind": ()}),
         ("--seed 999999: must be at most 999988", {"seed": 999_999}),
     ],
 )

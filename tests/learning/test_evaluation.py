@@ -1,6 +1,7 @@
 """An evaluation writes what it promises: a table, strict JSON and a video, without torch."""
 
 import json
+import os
 import pickle
 import re
 import shutil
@@ -156,6 +157,7 @@ def test_picture_shows_six_moments_of_the_first_episode(short, tmp_path):
     ("options", "error", "message"),
     [
         ({"episodes": 0}, ConfigError, "at least 1"),
+        ({"policy": ()}, ConfigError, "--policy: give at least one"),
         ({"env": None}, ConfigError, "^expert and random have no .*: give --env ID$"),
         (
             {"env": None, "policy": ("TPMReach-v0", "TPMPickAndPlace-v0")},
@@ -297,6 +299,15 @@ def test_command_line_errors_are_one_line(words, message):
         main(words.split())
     assert str(caught.value).startswith(f"error: {message}")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="it has no such files")
+def test_a_pipe_or_a_device_is_not_replaced_by_a_file(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(ConfigError, match=r"--json .*pipe: is a device or a pipe"):
+        evaluate(EvaluationConfig(("expert",), "TPMReach-v0", json=pipe), quiet())
+    assert pipe.is_fifo()
 
 
 def test_files_are_written_whole_or_not_at_all(tmp_path):

@@ -59,6 +59,10 @@ def test_a_card_replaces_no_file_of_others(tmp_path):
         export(tmp_path / "reach", RESULTS)
     assert card.read_text() == "my notes"
     card.unlink()
+    card.mkdir()
+    with pytest.raises(SystemExit, match="no model card of tpm_gym"):
+        export(tmp_path / "reach", RESULTS)
+    card.rmdir()
     for _ in range(2):  # an earlier card is replaced
         export(tmp_path / "reach", RESULTS)
     assert "library_name: tpm_gym" in card.read_text()

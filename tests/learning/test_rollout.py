@@ -6,6 +6,7 @@ from contextlib import closing
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import bootstrap, wilson
-from tpm_gym.learning.policies import load_policy
+from tpm_gym.learning.policies import NoisyPolicy, load_policy
 from tpm_gym.learning.rollout import (
     TEST_SEED,
     Episode,
@@ -206,3 +207,18 @@ def test_unknown_policies_say_what_there_is(reach, tmp_path):
         load_policy("exprt", reach)
     with pytest.raises(PolicyError, match=r"best\.json or .*last\.json"):
         load_policy(str(tmp_path), reach)
+
+
+@pytest.mark.parametrize("name", ["random", "noisy"])
+def test_actions_do_not_depend_on_the_goal(name):
+    """Environment and policy draw from one seed; from one generator, they correlated by 0.9."""
+    count = 1000
+    with closing(make_envs("TPMReach-v0", count, engine="analytic")) as envs:
+        still = Mock(act=lambda observation: np.zeros((count, 3)))
+        policy = load_policy("random", envs) if name == "random" else NoisyPolicy(still, 0.3)
+        observation, _ = envs.reset(seed=0)
+        policy.reset(observation, range(count))
+        actions = np.hstack([policy.act(observation) for _ in range(3)])
+    for sizes in (actions, np.abs(actions)):
+        joined = np.hstack([observation["desired_goal"], sizes])
+        assert np.abs(np.corrcoef(joined.T)[:3, 3:]).max() < 0.15

@@ -12,6 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 from trainings import (
+    Killed,
     assert_equal_runs,
     evaluations,
     interrupt_at,
@@ -25,8 +26,11 @@ import tpm_gym
 from tpm_gym.learning import (
     ResumeConfig,
     callbacks,
+    curve,
+    export,
     resume,
     train,
+    training,
 )
 from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore
@@ -92,6 +96,21 @@ def test_a_second_signal_leaves_at_once(number):
         with pytest.raises(SystemExit) as caught:
             signal.raise_signal(number)
     assert caught.value.code == 128 + number
+
+
+def test_a_worker_that_dies_ends_the_training(tmp_path, monkeypatch):
+    """Closing the environments would wait for it forever."""
+    config, made = make_config("ppo in processes", tmp_path), []
+    make = training.make_training_envs
+    monkeypatch.setattr(training, "make_training_envs", lambda c: made.append(make(c)) or made[0])
+    interrupt_at(monkeypatch, 161, lambda: made[0].processes[1].kill())
+    message = f"a worker or .* has ended .*; put that right, then .*tpm-gym resume {config.run}"
+    with pytest.raises(RunError, match=message):
+        train(config, quiet())
+    assert not any(process.is_alive() for process in made[0].processes)
+    monkeypatch.undo()
+    assert resume(ResumeConfig(config.run), quiet()) is None
+    assert_equal_runs(uninterrupted("ppo in processes"), config.run)
 
 
 NO_SPACE = os.strerror(errno.ENOSPC)
@@ -171,6 +190,46 @@ def test_a_finished_run_has_nothing_to_do_unless_it_is_to_take_more_steps(finish
     assert [line["steps"] for line in evaluations(finished)][-2:] == [300, 360]
     assert json.loads((finished / "config.json").read_text())["steps"] == 360
     assert not (finished / "tests").exists()  # they were of the policy of step 300
+
+
+def test_steps_that_were_added_are_not_forgotten_by_a_kill(finished, monkeypatch):
+    """Nor does the last policy of fewer steps pass for the end of the run."""
+    save = export.save
+
+    def killed_at_the_end(model, path, **options):
+        if path.name == "last":
+            raise Killed
+        return save(model, path, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(export, "save", killed_at_the_end)
+        patched.setattr(CheckpointStore, "save", lambda self, content: None)
+        with pytest.raises(Killed):
+            resume(ResumeConfig(finished, steps=360, eval_every=20), quiet())
+    assert not (finished / "last.zip").exists()
+    assert resume(ResumeConfig(finished), quiet()) is None
+    assert [line["steps"] for line in evaluations(finished)][-4:] == [300, 320, 340, 360]
+    assert tpm_gym.load_policy(finished / "last").description.steps == 360
+
+
+@pytest.mark.usefixtures("needs_pybullet")
+def test_a_kill_after_the_last_step_leaves_out_no_test(tmp_path, monkeypatch):
+    config = make_config("ppo in the analytic engine", tmp_path)
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "evaluate", Mock(side_effect=Killed))
+        with pytest.raises(Killed):
+            train(config, quiet())
+    drawn = Mock()
+    monkeypatch.setattr(curve, "draw_learning_curve", drawn)
+    console = quiet()
+    assert resume(ResumeConfig(config.run), console) is None
+    assert "success in the analytic engine and PyBullet" in said(console)
+    assert [line["steps"] for line in drawn.call_args.args[2]] == [0, 141, 282, 360]
+    assert {path.stem for path in config.run.glob("tests/*.json")} == {"analytic", "pybullet"}
+    before, console = contents(config.run), quiet()
+    assert resume(ResumeConfig(config.run), console) is None
+    assert "nothing to do" in said(console)
+    assert contents(config.run) == before
 
 
 def test_a_finished_run_is_finished_without_its_checkpoints(finished):

@@ -271,6 +271,10 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"algo": "ppo", "recipe_file": None}, "no recipe of ppo for TPMReach-v0; .*--recipe FILE"),
         ({"recipe_file": Path("none.yml")}, "cannot be read"),
         ({"device": "meta"}, "--device meta"),
+        ({"threads": 10**12}, "--threads 1000000000000: must be at most 1,024"),
+        ({"env": ":"}, "unknown environment ':'"),
+        ({"env": ":TPMReach-v0"}, "unknown environment ':TPMReach-v0'"),
+        ({"env": "json:"}, "unknown environment 'json:'"),
         ({"env_options": EnvOptions(machine="narrow")}, "machine = 'narrow'"),
     ],
 )

@@ -1,8 +1,10 @@
 """Searches with the real Optuna and Ray Tune."""
 
 import json
+from unittest.mock import Mock
 
 import pytest
+import ray
 import yaml
 
 from tpm_gym.learning.command_line import main
@@ -16,6 +18,7 @@ ANALYTIC = EnvOptions(engine="analytic")
 def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path, capsys):
     folder = tmp_path / "tuned"
     words = "tune --env TPMReachDense-v0 --engine analytic --trials 3 --steps 8192 --jobs 2"
+    words += " --shield --randomisation friction=0.5:1"
     main([*words.split(), "--folder", str(folder)])
     assert f"3 trainings of 8,192 steps; their logs: {folder}/NNN.log" in capsys.readouterr().out
     score = {}
@@ -37,11 +40,25 @@ def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path, capsys):
         (["--trials", "0"], "--trials 0: must be at least 1"),
         (["--folder", "."], "exists; give another"),
         (["--env", "TPMReach-v0"], "no recipe of ppo for TPMReach-v0"),
+        (["--engine", "no"], "engine = 'no' is not possible"),
+        (["--seed", "999971", "--engine", "analytic"], "--seed 999971: must be at most 999715"),
+        (["--jobs", "10001"], "--jobs 10001: must be at most 10,000"),
     ],
 )
 def test_mistakes_are_named_before_ray_starts(words, message):
     with pytest.raises(SystemExit, match=message):
         main(["tune", *words])
+
+
+def test_a_cluster_is_joined_with_the_cores_that_it_has(tmp_path, monkeypatch):
+    """Ray refuses a number of cores for a cluster that is there."""
+    monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
+    join = Mock(side_effect=ConnectionError("no cluster"))
+    monkeypatch.setattr(ray, "init", join)
+    words = ["tune", "--engine", "analytic", "--jobs", "2", "--folder", str(tmp_path / "tuned")]
+    with pytest.raises(SystemExit, match=r"RAY_ADDRESS 10\.0\.0\.1:6379: no cluster; start Ray"):
+        main(words)
+    assert join.call_args.kwargs["num_cpus"] is None
 
 
 @pytest.mark.usefixtures("registries")

@@ -14,6 +14,7 @@ import safetensors.numpy
 import safetensors.torch
 import torch
 from gymnasium import spaces
+from gymnasium.vector import SyncVectorEnv
 from policies_on_file import (
     DATA,
     WEIGHTS,
@@ -189,12 +190,12 @@ def test_joint_increments_are_no_cartesian_ones():
             policy.check(env)
         assert (caught.value.kind, caught.value.given) == ("control", "cartesian")
     for make in (lambda: gym.make("TPMPickAndPlaceDense-v0"), lambda: TPMEnv("pick_and_place")):
-        vector = DummyVecEnv([make])
-        with (
-            closing(vector),
-            pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJointsDense-v0"),
-        ):
-            policy.check(vector)
+        for vector in (DummyVecEnv([make]), SyncVectorEnv([make])):
+            with (
+                closing(vector),
+                pytest.raises(PolicyMismatchError, match="TPMPickAndPlaceJointsDense-v0"),
+            ):
+                policy.check(vector)
 
 
 # -- names -----------------------------------------------------------------------------------------

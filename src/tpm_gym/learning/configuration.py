@@ -20,6 +20,7 @@ UNSET: Final[Any] = None
 """Value of an option that :func:`complete` computes, or that a resumed run keeps."""
 
 _MOST_PROCESSES: Final = 1000
+_MOST_THREADS: Final = 1024
 
 
 def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
@@ -293,7 +294,7 @@ def check_least(config: Any, least: int, *names: str) -> None:
     """Refuse, with a ConfigError, an option that is given and too small."""
     for name in names:
         value = getattr(config, name)
-        if value is not UNSET and value < least:
+        if value is not UNSET and not value >= least:  # NaN is refused, too
             raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
 
 
@@ -315,6 +316,8 @@ def _check_numbers(config: TrainingConfig) -> None:
     check_least(config, 1, *counts)
     check_least(config, 0, "test_episodes", "demonstrations")
     envs, seed, episodes = config.envs or 1, config.seed, config.eval_episodes or 1
+    threads = config.threads
+    _refuse(threads > _MOST_THREADS, f"--threads {threads}: must be at most {_MOST_THREADS:,}")
     most = TEST_SEED - SELECTION_SEED
     _refuse(episodes > most, f"--eval-episodes {episodes}: must be at most {most:,}")
     most = SELECTION_SEED if config.env_options.in_batches else _MOST_PROCESSES

@@ -11,6 +11,7 @@ import copy
 import hashlib
 import importlib.util
 import json
+import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -112,7 +113,10 @@ class Dataset:
     @property
     def name(self) -> str:
         """Id in Minari."""
-        given = {**self.config.env_options.given(), "engine": ""}
+        own = check_env_id(self.env).kwargs.get("engine") or "pybullet"
+        given = {"engine": own, **self.config.env_options.given()}
+        if given["engine"] == "analytic":  # the command's default
+            del given["engine"]
         options = [value if isinstance(value, str) else key for key, value in given.items()]
         words = "-".join(filter(None, (self.kind, *options)))
         return f"{self.env.rpartition(':')[2]}/{words}-v0"
@@ -164,6 +168,11 @@ def _complete(config: CollectConfig) -> list[str]:
     """Check the options; return the ids."""
     check_least(config, 1, "episodes", "steps")
     check_least(config, 0, "seed", "noise")
+    for name in ("env", "kind"):
+        if getattr(config, name) == ():
+            raise ConfigError(f"--{name}: give at least one")
+    if not math.isfinite(config.noise):
+        raise ConfigError(f"--noise {config.noise}: must be finite")
     most = SELECTION_SEED - config.episodes
     if config.seed > most:
         raise ConfigError(f"--seed {config.seed}: must be at most {most}: later ones are held out")

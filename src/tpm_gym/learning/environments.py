@@ -47,8 +47,8 @@ def check_env_id(env_id: str) -> EnvSpec:
             f"is imported; if you trust the module, give --env {env_id}"
         )
     try:
-        spec = gym.spec(name)
-    except gym.error.Error as error:
+        spec = gym.spec(name if module else env_id)
+    except (gym.error.Error, ValueError) as error:  # ValueError: ":" with no module before it
         there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
     entry: Any = spec.entry_point

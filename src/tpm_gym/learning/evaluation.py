@@ -146,6 +146,8 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 
 
 def _check(config: EvaluationConfig) -> None:
+    if not config.policy:
+        raise ConfigError("--policy: give at least one")
     check_least(config, 1, "episodes", "video_episodes")
     check_least(config, 0, "seed")
     for option, suffix in {"json": "", "video": ".mp4", "picture": ".png"}.items():

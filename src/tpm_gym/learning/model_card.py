@@ -38,7 +38,9 @@ def write(policy: Path, evaluation: Path) -> Path:
             f"--evaluation {evaluation}: is of {tested['env']}, the policy is of {content['env']}"
         )
     card = policy.with_suffix(".md")
-    if card.exists() and _OURS not in card.read_text(encoding="utf-8", errors="replace"):
+    if card.is_dir() or (
+        card.exists() and _OURS not in card.read_text(encoding="utf-8", errors="replace")
+    ):
         raise ConfigError(f"{card}: is no model card of tpm_gym, and would be replaced; move it")
     try:
         text = _text(card.stem, content, tested)

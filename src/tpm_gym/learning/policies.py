@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tpm_gym.policy import Policy as ExportedPolicy
 
 SCRIPTED: Final = ("expert", "random")
+_ACTIONS: Final = 1  # not 0, which NumPy's seeds pad with
 
 
 @dataclass(frozen=True)
@@ -48,8 +49,12 @@ class RandomPolicy:
     rngs: list[np.random.Generator] = field(default_factory=list)
 
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
-        """Seed a generator for each episode with the episode's seed."""
-        self.rngs = [np.random.default_rng(seed) for seed in seeds]
+        """Seed a generator for each episode with the episode's seed.
+
+        The environment draws its goal from a generator of the seed alone. Uniform actions of an
+        equal generator would be a function of the goal.
+        """
+        self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
 
     def act(self, observation: Observation) -> Action:
         """Return actions that do not depend on ``observation``."""

@@ -97,6 +97,8 @@ def require_writable(option: str, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path.parent):
             problem = "is a folder" if path.is_dir() else None
+        if path.exists() and not (path.is_file() or path.is_dir()):  # renaming would replace it
+            problem = "is a device or a pipe"
     except OSError as error:
         problem = f"cannot be written: {error.strerror}"
     if problem:

@@ -21,7 +21,7 @@ from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.recipes import read_recipes, recipe_file
 from tpm_gym.learning.rollout import Action, Observation, Policy
-from tpm_gym.learning.training import make_model, make_training_envs
+from tpm_gym.learning.training import make_model, training_envs_of
 
 MOMENTS: Final = 10
 
@@ -87,7 +87,7 @@ def episodes(
     parts = [count * moment // MOMENTS for moment in range(MOMENTS + 1)]
     most = -(-count // MOMENTS) if options.in_batches else 1
     with (
-        closing(make_training_envs(config)) as training_envs,
+        training_envs_of(config) as training_envs,
         closing(make_envs(env, most, **options.given())) as envs,
     ):
 

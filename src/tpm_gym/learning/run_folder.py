@@ -177,13 +177,22 @@ def claimed(run: Path) -> Iterator[None]:
 
 @contextmanager
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
-    """Convert errors of a full or broken disk to a RunError that says how to continue."""
+    """Convert errors of a full or broken disk to a RunError that says how to continue.
+
+    So are the errors of a pipe to a process that has ended.
+    """
     try:
         yield
-    except OSError as error:
+    except (OSError, EOFError) as error:
         go_on = (
             "start it anew with --overwrite"
             if store.newest is None
             else f"continue from step {store.newest:,} with: {resume_command(run)}"
         )
-        raise RunError(f"cannot write to {run}: {error}; put that right, then {go_on}") from error
+        problem = f"cannot write to {run}: {error}"
+        if isinstance(error, ConnectionError | EOFError):
+            problem = (
+                f"a worker or the reader of the output has ended ({type(error).__name__}; a "
+                "worker's own error stands above, and without one memory was full)"
+            )
+        raise RunError(f"{problem}; put that right, then {go_on}") from error

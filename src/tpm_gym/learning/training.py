@@ -13,7 +13,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
 from tpm_gym.learning.demonstrations import Demonstrations
-from tpm_gym.learning.environments import import_module_of, make_env, make_envs
+from tpm_gym.learning.environments import check_env_id, import_module_of, make_env, make_envs
 from tpm_gym.learning.errors import (
     CheckpointError,
     ConfigError,
@@ -51,6 +51,13 @@ from tpm_gym.learning.run_folder import (
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.vec_env import AnalyticVecEnv
 
+_TESTED: Final = ("analytic", "pybullet")  # engines of the last test
+_CHANGEABLE: Final = {
+    **dict.fromkeys(("steps", "eval_every", "checkpoint_every", "threads"), int),
+    "device": str,
+}
+"""Options that resuming can change, and their types; the id stays."""
+
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:
     """Train a policy and write the run folder; progress is shown on ``console``.
@@ -66,6 +73,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     """
     console = console or Console()
     import_module_of(config.env)
+    check_env_id(config.env)
     with closing(make_env(**config.env_arguments)) as env:  # refused before all else
         size = flatdim(env.observation_space)
     asked, config = config.steps, complete(config)
@@ -99,7 +107,7 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
     A run that was killed before its first checkpoint begins again. A finished run stays as it is,
-    unless it is given more steps.
+    unless it is given more steps; a missing learning curve or last test is made.
 
     Raises:
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
@@ -113,13 +121,14 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     with run_folder.disk_errors_named(run, store), run_folder.claimed(run):
         stored = run_folder.description(run)
         if stored is not None and is_finished(run) and config.steps in (UNSET, stored["steps"]):
-            resumed(config, stored, 0)  # checks the options
-            _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
+            checked = resumed(config, stored, 0)
+            if not _Session(checked, console, store, stored, None).complete():
+                _say(console, f"nothing to do: {run} has finished its {stored['steps']:,} steps")
             return None
         content = store.load(lambda text: _say(console, f"warning: {text}"))
         if content:
             with _foreign_named(run):
-                stored = dict(json.loads(content.files[CONFIG_FILE]))
+                stored = _with_changes(dict(json.loads(content.files[CONFIG_FILE])), stored or {})
         elif stored is None:
             raise RunError(f"{run} holds no run of tpm_gym; start one with tpm-gym train")
         elif run_folder.holds_policy(run):
@@ -136,6 +145,17 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             "resumed": [*stored.get("resumed", []), resumption],
         }
         return _Session(changed, console, store, description, content).run()
+
+
+def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str, Any]:
+    """Apply the options of an earlier resumption that was killed before its first checkpoint.
+
+    Args:
+        saved: Configuration in the checkpoint.
+        newest: Configuration in the folder of the run.
+    """
+    given = {name: newest.get(name) for name in _CHANGEABLE}
+    return saved | {n: value for n, value in given.items() if isinstance(value, _CHANGEABLE[n])}
 
 
 @contextmanager
@@ -172,7 +192,7 @@ class _Session:
         torch.set_num_threads(config.threads)
         count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
         with ExitStack() as stack:
-            training_envs = stack.enter_context(closing(make_training_envs(config)))
+            training_envs = stack.enter_context(training_envs_of(config))
             envs = stack.enter_context(closing(make_envs(count=count, **config.env_arguments)))
             bar = stack.enter_context(closing(callbacks.ProgressBar(self.console)))
             model = make_model(config, training_envs)
@@ -262,15 +282,31 @@ class _Session:
             _say(self.console, f"stopped early by {stopped_by.name}, {saved}")
             return
         _say(self.console, f"finished: {config.run}")
-        if config.env_options.in_batches and config.test_episodes:
+        if self._has_test:
             self._test()
+
+    def complete(self) -> bool:
+        """Make what a kill after the last step left out; return whether the test was."""
+        config = self.config
+        if not (config.run / CURVE_FILE).exists():
+            evaluations = run_folder.evaluations(config.run)
+            curve.draw_learning_curve(config.run / CURVE_FILE, config.title, evaluations)
+        files = [config.run / TESTS / f"{engine}.json" for engine in _TESTED]
+        if not self._has_test or all(file.exists() for file in files):
+            return False
+        self._test()
+        return True
+
+    @property
+    def _has_test(self) -> bool:
+        return self.config.env_options.in_batches and self.config.test_episodes > 0
 
     def _test(self) -> None:
         """Test the best policy in the analytic engine and in PyBullet; print success and events."""
         config = self.config
         _say(self.console, f"testing {config.test_episodes} held-out episodes in each engine ...")
         rates: dict[str, list[str]] = {}
-        for engine in ("analytic", "pybullet"):
+        for engine in _TESTED:
             test = EvaluationConfig(
                 policy=(str(config.run),),
                 env=config.env,
@@ -305,6 +341,29 @@ def _require_room(config: TrainingConfig, numbers: int) -> None:
         np.empty((size, 2, numbers), np.float32)
     except (MemoryError, ValueError) as error:  # beyond all addresses it is a ValueError
         raise ConfigError(f"--recipe {config.recipe_file}: {name} {size}: {error}") from error
+
+
+@contextmanager
+def training_envs_of(config: TrainingConfig) -> Iterator[VecEnv]:
+    """Build the training environments, and close them at the end.
+
+    If a worker has ended, or a step was interrupted, closing would wait forever for answers of the
+    workers. They are killed instead.
+    """
+    envs = make_training_envs(config)
+    try:
+        yield envs
+    except BaseException as error:
+        if isinstance(envs, SubprocVecEnv) and (
+            envs.waiting or isinstance(error, ConnectionError | EOFError)
+        ):
+            for process in envs.processes:
+                process.kill()
+                process.join()
+            envs.closed = True
+        raise
+    finally:
+        envs.close()
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:

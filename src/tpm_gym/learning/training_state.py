@@ -36,7 +36,7 @@ from tpm_gym.learning.checkpoint import STATE, TENSORS, Content, starting
 from tpm_gym.learning.errors import CheckpointError
 from tpm_gym.learning.provenance import versions, write_whole
 from tpm_gym.learning.rollout import Action, GoalEnv, Observation
-from tpm_gym.learning.run_folder import LAST, LAST_FILE, PROGRESS_FILE, RESTORED, clear_tests
+from tpm_gym.learning.run_folder import CONFIG_FILE, LAST, PROGRESS_FILE, RESTORED, clear_tests
 from tpm_gym.learning.vec_env import AnalyticVecEnv
 
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
@@ -146,7 +146,8 @@ def capture(model: BaseAlgorithm, run: Path, seconds: float, finished: bool = Fa
 def restore_files(run: Path, content: Content) -> None:
     """Set the files of a run back to a checkpoint; delete the files of later policies."""
     clear_tests(run)
-    for name in {*RESTORED, *LAST} - {LAST_FILE}:
+    # last.zip marks a finished run, so an earlier one must not stay.
+    for name in {*RESTORED, *LAST} - {CONFIG_FILE}:  # it is written anew at once
         if name in content.files:
             write_whole(run / name, partial(Path.write_bytes, data=content.files[name]))
         else:

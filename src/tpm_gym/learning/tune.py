@@ -5,9 +5,11 @@ the mean success of the last three evaluations, plus a thousandth of their retur
 return decides between equal successes.
 """
 
+import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,12 +31,15 @@ from tpm_gym.learning.configuration import (
     complete,
     unset,
 )
+from tpm_gym.learning.environments import make_env
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.rollout import SELECTION_SEED
 from tpm_gym.learning.run_folder import evaluations
 
 RECIPE_FILE: Final = "recipe.yml"
 """File of the best recipe in the folder of a search; give it to ``train --recipe``."""
 
+_MOST_JOBS: Final = 10_000
 _SHARED: Final = ("algo", "env", "steps", "env_options", "randomisation")  # with TrainingConfig
 
 _SPACE: Final[Mapping[str, Sequence[float]]] = {
@@ -97,12 +102,19 @@ def tune(config: TuneConfig) -> Path:
     """
     check_least(config, 1, "trials", "jobs", "steps")
     check_least(config, 0, "seed")
+    if (config.jobs or 1) > _MOST_JOBS:
+        raise ConfigError(f"--jobs {config.jobs}: must be at most {_MOST_JOBS:,}")
     name = config.env.rpartition(":")[2]
     folder = config.folder or Path("runs", f"tune-{name}-{config.algo}")
     if folder.exists():
         raise ConfigError(f"--folder {folder}: exists; give another")
     shared = {name: getattr(config, name) for name in _SHARED}
     base = complete(TrainingConfig(**shared, test_episodes=0))
+    most = SELECTION_SEED - base.envs - config.trials + 1  # of the last training, too
+    if config.seed > most:
+        raise ConfigError(f"--seed {config.seed}: must be at most {most}: later ones are held out")
+    with closing(make_env(**base.env_arguments)):  # refuses an unknown machine or engine
+        pass
     provenance.require_writable("--folder", folder)
     print(f"{config.trials} trainings of {base.steps:,} steps; their logs: {folder}/NNN.log")
     print("starting Ray, which takes some seconds ...", flush=True)
@@ -127,7 +139,13 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
         ray_tune.report({"score": _train(base, changes, folder, config.seed, here)})
 
     if not ray.is_initialized():
-        ray.init(num_cpus=config.jobs, include_dashboard=False, log_to_driver=False)
+        # Ray refuses a number of CPUs for a cluster that is there.
+        address = os.environ.get("RAY_ADDRESS")
+        jobs = None if address else config.jobs
+        try:
+            ray.init(num_cpus=jobs, include_dashboard=False, log_to_driver=False)
+        except ConnectionError as error:
+            raise ConfigError(f"RAY_ADDRESS {address}: {error}; start Ray there") from error
     sampler, space = TPESampler(seed=config.seed), partial(_suggest, config.algo)
     search = OptunaSearch(space, metric="score", mode="max", sampler=sampler)
     settings = ray_tune.TuneConfig(
@@ -160,7 +178,8 @@ def _train(
     _write(recipe, base, changes)
     options = {"algo": base.algo, "env": base.env, "steps": base.steps, "seed": seed + number}
     options |= {"recipe": recipe, "run": run, "test-episodes": 0, **base.env_options.given()}
-    words = [word for key, value in options.items() for word in (f"--{key}", str(value))]
+    flags = [f"--{key}" for key, value in options.items() if value is True]
+    words = [f"--{key}={value}" for key, value in options.items() if value is not True] + flags
     words += ["--randomisation", *base.randomisation] if base.randomisation else []
     # In a process of its own: Ray Tune calls this in a thread, which cannot receive signals.
     with log.open("w", encoding="utf-8") as file:
