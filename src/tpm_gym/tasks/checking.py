@@ -38,6 +38,10 @@ def check(task: Task, taken: Sequence[str] = ()) -> None:
     for event in task.events:
         if event in known:
             raise ConfigurationError("events", event, f"names other than {', '.join(known)}")
+        if event.startswith("_"):
+            raise ConfigurationError("events", event, "names that do not begin with _")
+        if not callable(getattr(task, event, None)):
+            raise ConfigurationError("events", event, "names of methods of the task")
         known.append(event)
     task.start([np.random.default_rng(0)])
     several = _example_states(task.machine, task.scene)
@@ -78,8 +82,25 @@ def _check_shapes(task: Task, state: State) -> None:
             raise ConfigurationError("shaping()", name, "names other than goal, singularity")
         finite(f"shaping()[{name!r}]", values, (_EXAMPLES,), ConfigurationError)
     for event in task.events:
-        if (kind := np.asarray(getattr(task, event)(state)).dtype) != np.bool_:
+        values = np.asarray(getattr(task, event)(state))
+        if (kind := values.dtype) != np.bool_:
             raise ConfigurationError(f"{event}()", f"of type {kind}", "(n,) bool")
+        _require_shape(f"{event}()", values, ())
+    for entry in task.entries:  # before observe(), whose compiled loops do not check lengths
+        seen = np.asarray(entry.source(state))
+        if seen.ndim == 2 and entry.columns is not None:
+            seen = seen[:, slice(*entry.columns)]
+        _require_shape(f"observed(), {entry.name!r}", seen, (len(entry.scale),))
+    gap = task.gap(task.achieved(state), np.zeros((_EXAMPLES, task.goal_size)))
+    _require_shape("gap()", gap, ())
+
+
+def _require_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
+    """Refuse values that are not of this shape for each robot."""
+    if np.shape(values) != (_EXAMPLES, *shape):
+        wanted = f"(n, {shape[0]})" if shape else "(n,)"
+        valid = f"values {wanted} for n robots, each from its own row; reduce by axis=-1"
+        raise ConfigurationError(name, f"of shape {np.shape(values)} for {_EXAMPLES}", valid)
 
 
 def _equal(row: Any, single: Any) -> bool:
