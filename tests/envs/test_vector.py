@@ -1,5 +1,7 @@
 """Vector environments: as Gymnasium wants them, and each row as the environment alone."""
 
+import copy
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -151,6 +153,60 @@ def test_what_is_saved_goes_on_equally(randomisation):
         again.restore_state(moment)
         for actions, wanted in zip(course[30:], expected, strict=True):
             assert_same(again.step(actions)[0], wanted[0])
+
+
+def test_copies_step_in_threads_of_their_own():
+    envs = make(PICK, 6, num_threads=2)
+    envs.reset(seed=0)
+    course = actions_of(envs, 5)
+    envs.step(course[0])
+    copies = copy.deepcopy(envs), pickle.loads(pickle.dumps(envs))
+    expected = [envs.step(actions) for actions in course]
+    envs.close()
+    for each in copies:
+        for actions, wanted in zip(course, expected, strict=True):
+            assert_same(each.step(actions)[0], wanted[0])
+        each.close()
+
+
+def test_refused_snapshots_change_nothing():
+    envs, alone = make(PICK, 6, num_threads=2), gym.make(PICK, engine="analytic")
+    single = make(PICK, 1)
+    for each in (envs, alone, single):
+        each.reset(seed=0)
+    first, _ = envs.save_state()
+    envs.reset(seed=1)
+    goal = envs.goal
+    for wrong in (None, single.save_state()[0]):
+        with pytest.raises(InputError, match="snapshot"):
+            envs.restore_state([first, wrong])
+        np.testing.assert_array_equal(envs.goal, goal)
+    with pytest.raises(InputError, match="of a vector environment"):
+        single.restore_state([alone.unwrapped.save_state()])
+
+
+@pytest.mark.parametrize("engine", ["analytic", "pybullet"])
+def test_the_first_reset_may_be_of_some(engine):
+    mask, actions = np.array([False, True, False]), np.zeros((3, 3), dtype=np.float32)
+    envs, all_at_once = (gym.make_vec(REACH, num_envs=3, engine=engine) for _ in range(2))
+    observation, infos = envs.reset(seed=4, options={"reset_mask": mask})
+    expected, _ = all_at_once.reset(seed=4)
+    assert_same(infos["_conditioning"], mask)
+    for name, values in observation.items():
+        assert_same(values[mask], expected[name][mask])
+        assert np.isfinite(values).all()
+    _, rewards, _, _, infos = envs.step(actions)  # resets the others
+    expected, wanted, *_ = all_at_once.step(actions)
+    assert_same(rewards, np.where(mask, wanted, 0.0))
+    envs.close()
+    envs = gym.make_vec(REACH, num_envs=3, engine=engine, autoreset_mode="Disabled")
+    envs.reset(seed=4, options={"reset_mask": mask})
+    with pytest.raises(EpisodeError, match=r"environment 0.*reset_mask"):
+        envs.step(actions)
+    envs.reset(options={"reset_mask": ~mask})
+    envs.step(actions)
+    envs.close()
+    all_at_once.close()
 
 
 @pytest.mark.parametrize("env_id", [REACH, PICK])

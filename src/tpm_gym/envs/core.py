@@ -369,12 +369,7 @@ class Core:
                 then.
         """
         self.require_open()
-        if not isinstance(snapshot, EnvSnapshot):
-            raise InputError("snapshot", type(snapshot), "what save_state() returned")
-        other = [name for name in self.kind if snapshot.kind.get(name) != self.kind[name]]
-        if other:
-            differing = f"another {', '.join(other)}"
-            raise InputError("snapshot", differing, "of the same task and options")
+        self.require_equal(snapshot)
         self.rngs = [np.random.default_rng() for _ in snapshot.rngs]
         for rng, state in zip(self.rngs, snapshot.rngs, strict=True):
             rng.bit_generator.state = state
@@ -385,6 +380,15 @@ class Core:
         self.episode += 1  # the expert must plan again
         self.simulation.restore(snapshot.simulation)
         return self.report()[0]
+
+    def require_equal(self, snapshot: Any) -> None:
+        """Raise InputError if ``snapshot`` is no snapshot of these or equal environments."""
+        if not isinstance(snapshot, EnvSnapshot):
+            raise InputError("snapshot", type(snapshot), "what save_state() returned")
+        other = [name for name in self.kind if snapshot.kind.get(name) != self.kind[name]]
+        if other:
+            differing = f"another {', '.join(other)}"
+            raise InputError("snapshot", differing, "of the same task and options")
 
     def require_open(self) -> None:
         """Raise EpisodeError if the environments are closed."""

@@ -120,7 +120,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise
         ends = np.cumsum([part.core.count for part in self._parts]).tolist()
         self._slices = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
-        self._pool = ThreadPoolExecutor(num_threads) if num_threads > 1 else None
+        self._threads = int(num_threads)
+        self._pool = self._make_pool()
         first = self._parts[0].core
         self.metadata["render_fps"] = round(1 / first.task.control_period)
         self.task, self.machine, self.control = first.task, first.machine, first.control
@@ -130,6 +131,18 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         self._shape = self.num_envs, self.task.action_size
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
+
+    def _make_pool(self) -> ThreadPoolExecutor | None:
+        return ThreadPoolExecutor(self._threads) if self._threads > 1 else None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return everything except the threads, for :func:`copy.deepcopy` and :mod:`pickle`."""
+        return {**vars(self), "_pool": None}
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Restore the environments, and start threads of their own."""
+        vars(self).update(values)
+        self._pool = None if self.closed else self._make_pool()
 
     def _each(self, function: Callable[[_Part, slice], Any]) -> list[Any]:
         """Call a function for each part, in parallel if there are several threads."""
@@ -344,12 +357,14 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             The observation at that moment.
 
         Raises:
-            InputError: If they are no snapshots of equal environments.
+            InputError: If they are no snapshots of equal environments; nothing has happened then.
         """
         self._require_open()
         if not isinstance(snapshots, list) or len(snapshots) != len(self._parts):
             valid = "what save_state() of as many environments and threads returned"
             raise InputError("snapshots", brief(snapshots), valid)
+        for part, snapshot in zip(self._parts, snapshots, strict=True):
+            part.require_equal(snapshot)
         pairs = zip(self._parts, snapshots, strict=True)
         return self._merged([(part.restore(snapshot), {}) for part, snapshot in pairs])[0]
 
@@ -376,6 +391,11 @@ class _Part:
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
         infos = {}
+        if not core.rngs and len(rows) < core.count:
+            # The engine needs all robots at home. The others still wait for their own reset.
+            others = np.setdiff1d(np.arange(core.count), rows)
+            self._begin(others, [own[k] for k in others.tolist()])
+            self.ended[others] = True
         if len(rows):
             infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
         observation, _, info = core.report()
@@ -434,6 +454,13 @@ class _Part:
             "final_info": _masked(last, rows, core.count),
             "_final_info": ended,
         }
+
+    def require_equal(self, snapshot: Any) -> None:
+        """Raise InputError if it is no snapshot of an equal part of a vector environment."""
+        self.core.require_equal(snapshot)
+        if "elapsed" not in snapshot.columns:
+            valid = "from save_state() of a vector environment, which counts steps"
+            raise InputError("snapshot", "from a single environment", valid)
 
     def restore(self, snapshot: EnvSnapshot) -> Observation:
         """Continue from a snapshot."""

@@ -66,6 +66,9 @@ class BulletEngine:
         # Torques at rest and of servo drives, for which Bullet reports zero after a restore, or the
         # joint friction. None: use Bullet's torques.
         self._torque: Vector | None = _ZERO
+        # What was restored last, until the robot moves. Bullet normalises quaternions, so that
+        # reading them again could give other bits.
+        self._restored: _Saved | None = None
         self.client = Client(self.physics, renderer=renderer)
         self._window: Window | None = None
         if gui:
@@ -115,6 +118,7 @@ class BulletEngine:
 
     def place(self, rows: IntArray, theta: FloatArray, objects: FloatArray) -> None:
         """Implement :meth:`Engine.place`."""
+        self._restored = None
         self._cup.take(Grip())
         self.robot.place(self._machine.joint_positions(theta[0]))
         if self._drives is not None:
@@ -130,6 +134,7 @@ class BulletEngine:
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Implement :meth:`Engine.advance`."""
+        self._restored = None
         cup, friction, step, on = self._cup, self._friction, self.client.stepSimulation, vacuum[0]
         targets, drive = steering(self._drives, path, self.robot)
         near = cup.find_near(len(targets), on)
@@ -170,6 +175,8 @@ class BulletEngine:
 
     def save(self) -> Any:
         """Implement :meth:`Engine.save`."""
+        if self._restored is not None:
+            return self._restored
         return _Saved(
             self.robot.joint_states(),
             self._torque or self.robot.motors()[2],
@@ -188,6 +195,7 @@ class BulletEngine:
         self._scenery.place(saved.objects)
         self._friction.reset()
         self._cup.take(saved.grip)
+        self._restored = saved
 
     def picture(self, row: int, view: View) -> Picture:
         """Implement :meth:`Engine.picture`."""
