@@ -285,7 +285,9 @@ class Task(ABC):
         """
         chosen = {} if options is None else self._chosen(options)
         given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
-        starts = self.sample(rngs, dict(given))
+        starts: object = self.sample(rngs, dict(given))
+        if not isinstance(starts, dict):
+            raise ConfigurationError("sample()", starts, "a dictionary of arrays, by name")
         if starts.keys() != self._sizes.keys():
             valid = f"the keys {', '.join(self._sizes)}"
             raise ConfigurationError("sample()", list(starts), valid)
