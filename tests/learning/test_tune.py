@@ -4,7 +4,6 @@ import json
 from unittest.mock import Mock
 
 import pytest
-import ray
 import yaml
 from processes import PYTHON, printed_by
 
@@ -58,7 +57,7 @@ def test_a_cluster_is_joined_with_the_cores_that_it_has(tmp_path, monkeypatch):
     """Ray refuses a number of cores for a cluster that is there."""
     monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
     join = Mock(side_effect=ConnectionError("no cluster"))
-    monkeypatch.setattr(ray, "init", join)
+    monkeypatch.setattr("ray.init", join)  # imported here: Ray keeps the settings of its import
     words = ["tune", "--engine", "analytic", "--jobs", "2", "--folder", str(tmp_path / "tuned")]
     with pytest.raises(SystemExit, match=r"RAY_ADDRESS 10\.0\.0\.1:6379: no cluster; start Ray"):
         main(words)
