@@ -158,11 +158,6 @@ class Core:
     def _make_shield(self, shield: bool | float) -> Shield:
         from tpm_gym.envs.shield import make_shield  # imports Numba
 
-        if self.task.accelerations is not None:
-            # The shield's command may stop at once. The motors could not follow it, and the robot
-            # would pass a singularity that it does not pass without the shield.
-            valid = f"False: {type(self.task).__name__} bounds accelerations, the shield does not"
-            raise ConfigurationError("shield", shield, valid)
         exact = self.drive is None and not self._altered
         return make_shield(shield, self.machine, self.control, exact)
 
