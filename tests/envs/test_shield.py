@@ -17,6 +17,7 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.tasks.control import Control, make_control
+from tpm_gym.tasks.expert import Expert
 
 CLOSE = 0.003  # in units of the action
 
@@ -192,6 +193,36 @@ def test_no_engine_comes_below_safe_with_ideal_drives(engine: str) -> None:
     assert push(without, 100).min() < 0.06
     with_shield.close()
     without.close()
+
+
+@pytest.mark.parametrize("machine", ["paper", "wide"])
+@pytest.mark.parametrize("env_id", ["TPMCycle-v0", "TPMCycleJoints-v0"])
+def test_robots_at_full_speed_brake_in_time(env_id: str, machine: str) -> None:
+    # Motors cannot stop a robot in one control step of 4 ms.
+    options = {"num_envs": 64, "engine": "analytic", "machine": machine}
+    envs: Any = gym.make_vec(env_id, shield=True, **options)
+    envs.reset(seed=0)
+    rng, fastest = np.random.default_rng(0), 0.0
+    for step in range(75):
+        if step % 10 == 0:
+            actions = rng.choice([-1.0, 1.0], (64, 3))
+        *_, infos = envs.step(actions)
+        assert infos["conditioning"].min() >= 0.08
+        fastest = max(fastest, float(np.abs(envs.state.fk_velocity).max()))
+    assert fastest > 2.0
+    envs.close()
+
+
+def test_a_shield_that_brakes_leaves_safe_commands_as_they_are() -> None:
+    found = []
+    for shield in (False, True):
+        with gym.make("TPMCycle-v0", engine="analytic", shield=shield) as env:
+            expert = Expert(env)
+            observation, _ = env.reset(seed=1)
+            for _ in range(75):
+                observation, *_ = env.step(expert.act(observation))
+            found.append(bits(observation))
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("machine", ["paper", "wide"])

@@ -25,7 +25,7 @@ from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
 if TYPE_CHECKING:
-    from tpm_gym.envs.shield import Shield
+    from tpm_gym.envs.shield import BrakingShield, Shield
 
 __all__ = [
     "Core",
@@ -123,6 +123,7 @@ class Core:
         self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self._altered = self.randomisation != Randomisation()
+        self._follower = self._make_follower()
         self._shield = None if shield is False else self._make_shield(shield)
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
         self._pixels: Pixels | None = None
@@ -143,7 +144,6 @@ class Core:
             "number of environments": count,
             "observations": observations,
         }
-        self._follower = self._make_follower()
         self._home = self.machine.require_inverse(np.array(self.machine.home))
         self._state: State | None = None
         self.closed = False
@@ -155,11 +155,11 @@ class Core:
         self._views = np.zeros((self.task.camera_delay, count, len(self.task.scene.objects), 9))
         self.simulation = self._start()
 
-    def _make_shield(self, shield: bool | float) -> Shield:
+    def _make_shield(self, shield: bool | float) -> Shield | BrakingShield:
         from tpm_gym.envs.shield import make_shield  # imports Numba
 
         exact = self.drive is None and not self._altered
-        return make_shield(shield, self.machine, self.control, exact)
+        return make_shield(shield, self.machine, self.control, self._follower, exact)
 
     def _make_follower(self) -> Follower | None:
         if self.task.accelerations is None:

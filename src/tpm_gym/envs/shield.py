@@ -10,6 +10,9 @@ Therefore the nearest command is mostly the nearest point of the surface ``condi
 It is found by sequential quadratic programming, and the path is checked. Where the check fails, the
 aim is raised, and at last the command is moved towards the last one.
 
+Where a task bounds the accelerations of commands, a robot cannot hold the last command at once.
+There :class:`BrakingShield` asks that the robot can still brake in time.
+
 Importing this module imports Numba.
 """
 
@@ -23,9 +26,9 @@ from tpm_gym.arrays import FloatArray, is_number
 from tpm_gym.compiling import kept
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.tasks.control import Control
+from tpm_gym.tasks.control import Control, Follower
 
-__all__ = ["Shield", "make_shield"]
+__all__ = ["BrakingShield", "Shield", "make_shield"]
 
 MARGIN = 0.15
 """Fraction of the safe conditioning that is kept besides with servo drives or other plants."""
@@ -37,6 +40,8 @@ _STEPS = 6  # of sequential quadratic programming, at most
 _CLOSE = 0.005  # last step, in units of the action: the next one would be a hundredth
 _ROUNDS = 3  # of raising the aim where the path is less safe than its ends
 _HALVINGS = 20
+_PARTINGS = 8  # halvings between braking and the wanted command
+_LONGEST = 200  # control steps until a robot that brakes is at rest, at most
 _SWEEPS = 200  # of the quadratic program, at most
 _NUDGE = 1e-4  # of a step, for derivatives of the conditioning
 
@@ -179,13 +184,81 @@ class Shield:
         return shortened
 
 
-def make_shield(shield: Any, machine: Machine, control: Control, exact: bool) -> Shield:
+class BrakingShield:
+    """Replacement of commands after which robots could not brake in time, for n robots.
+
+    A command is safe if the conditioning stays at ``least`` or above on its path, and while the
+    robot brakes after it as hard as the follower allows. No torque may exceed the motors' peak. So
+    it is always safe to brake, because the rest of the last braking is safe. An unsafe command is
+    moved towards the command of braking, in a straight line.
+
+    Args:
+        machine: Nominal machine.
+        follower: Limit of commands to what the motors can follow.
+        least: Smallest conditioning on the path of the commands.
+    """
+
+    def __init__(self, machine: Machine, follower: Follower, least: float) -> None:
+        """Keep the arguments."""
+        self._machine, self._follower, self.least = machine, follower, least
+        self._nodes = _nodes()
+
+    def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
+        """Return safe commands (n, 3) m between braking and the wanted ones.
+
+        A robot that starts with less conditioning gets commands that are no worse than braking.
+
+        Args:
+            wanted: (n, 3) m, commands by control and follower, machine's frame.
+            recent: (n, 2, 3) m, the last two commands.
+        """
+        reached = self._lowest(wanted, recent)
+        rows = np.flatnonzero(~(reached >= self.least + TOLERANCE / 2))
+        if not len(rows):
+            return wanted
+        recent, reached = recent[rows], reached[rows]
+        brake = self._follower.limit(recent[:, 1], recent[:, 1], recent[:, 0])
+        least = np.minimum(self.least + TOLERANCE / 2, self._lowest(brake, recent))
+        whole = wanted[rows] - brake
+        low = (reached >= least)[:, None] * 1.0
+        high = np.ones_like(low)
+        for _ in range(_PARTINGS):
+            middle = (low + high) / 2
+            safe = (self._lowest(brake + middle * whole, recent) >= least)[:, None]
+            low, high = np.where(safe, middle, low), np.where(safe, high, middle)
+        command: FloatArray = wanted.copy()
+        command[rows] = np.where(low < 1.0, brake + low * whole, wanted[rows])
+        return command
+
+    def _lowest(self, command: FloatArray, recent: FloatArray) -> FloatArray:
+        """Return the smallest conditioning (r,) until robots that get a command and brake rest."""
+        found: FloatArray = np.full(len(command), np.inf)
+        rows, (before, current), then = np.arange(len(command)), recent.swapaxes(0, 1), command
+        for _ in range(_LONGEST):
+            corners = np.stack([(before + current) / 2, current, then], axis=1)
+            points = placed(corners, self._nodes)
+            least = lowest(self._machine.conditioning_at(points))
+            least[~self._follower.feasible(before, current, then)] = -np.inf
+            found[rows] = np.minimum(found[rows], least)
+            going = (then != current).any(axis=1) & (found[rows] > 0)
+            if not going.any():
+                return found
+            rows, before, current = rows[going], current[going], then[going]
+            then = self._follower.limit(current, current, before)
+        found[rows] = -np.inf
+        return found
+
+
+def make_shield(
+    shield: Any, machine: Machine, control: Control, follower: Follower | None, exact: bool
+) -> Shield | BrakingShield:
     """Return the shield of an environment's option.
 
     Args:
         shield: True, or the conditioning to keep.
         machine: Nominal machine.
         control: Control of the environment.
+        follower: Limit of its commands, if their accelerations are bounded.
         exact: Whether the robot follows its commands exactly; else True keeps a ``MARGIN``.
 
     Raises:
@@ -201,7 +274,8 @@ def make_shield(shield: Any, machine: Machine, control: Control, exact: bool) ->
     if not is_number(least) or not 0 < least <= 1:
         valid = "False, True, or a conditioning in (0, 1] to keep"
         raise ConfigurationError("shield", shield, valid)
-    return Shield(machine, control, float(least))
+    plain = Shield(machine, control, float(least))
+    return plain if follower is None else BrakingShield(machine, follower, plain.least)
 
 
 @kept

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
@@ -235,6 +235,12 @@ class Follower:
             share = np.nanmin(room / np.abs(most - steady), axis=-1, initial=1.0)
         commands: FloatArray = straight + np.maximum(share, 0.0)[:, None] * (asked - straight)
         return commands
+
+    def feasible(self, before: FloatArray, current: FloatArray, then: FloatArray) -> BoolArray:
+        """Return whether the motors' peak torques allow the spline of three commands, (n,)."""
+        (torques,) = np.abs(self._torques(before, current, then[None]))
+        enough: BoolArray = (torques <= self._most / USABLE).all(axis=-1)
+        return enough
 
     def _torques(self, before: FloatArray, current: FloatArray, then: FloatArray) -> FloatArray:
         """Return the torques (k, n, 3) N m on the splines to each of k next commands (k, n, 3)."""
