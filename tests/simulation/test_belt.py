@@ -116,6 +116,18 @@ def test_a_block_beside_the_belt_or_on_one_that_stands_still_rests(engine: str) 
         np.testing.assert_allclose(line.run([(STILL, 10)])[-1, 0], place, atol=1e-4)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_belt_that_ran_in_the_last_episode_stands_still(engine: str) -> None:
+    place = (-0.3, -0.03, FLAT / 2)
+    line = Line(engine, (-0.1, -0.03, 0.15), [place])
+    line.run([(STILL, 10)])
+    simulation = line.simulation
+    theta = PAPER_TPM.require_inverse(simulation.commands)
+    objects = {"block 0": np.array([place])}
+    simulation.reset(np.arange(1), theta, objects, belt_speed=np.zeros(1))
+    assert np.abs(line.run([(STILL, 10)]) - place).max() < 1e-3
+
+
 def test_each_robot_has_a_speed_of_its_own_and_computes_as_it_does_alone() -> None:
     speeds, start = [0.05, 0.0, 0.2], [(-0.3, -0.03, 0.015)]
     together = Line("analytic", (-0.1, -0.03, 0.15), start, speeds=speeds).run([(STILL, 10)])

@@ -131,6 +131,8 @@ class BulletEngine:
         """Implement :meth:`Engine.set_belt`."""
         self._scenery.belt_speed = float(speed[0])
         self._friction.set_belt(float(speed[0]))
+        if not speed[0]:
+            self._scenery.run_belts()  # stops them; advance() leaves belts at rest alone
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Implement :meth:`Engine.advance`."""
