@@ -358,3 +358,28 @@ def test_blocks_of_a_stack_start_beside_each_other(machine):
     starts = task.start([np.random.default_rng(seed) for seed in range(3000)])
     gap = np.abs(starts["lower"] - starts["upper"])[:, :2].max(axis=1)
     assert (gap > task.scene.objects[0].width).all()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"tolerance": float("nan")}, "tolerance = nan .*above 0"),
+        ({"tolerance": -0.01}, "tolerance = -0.01 .*above 0"),
+        ({"tolerance": "x"}, "tolerance = 'x' .*above 0"),
+        ({"camera_delay": -1}, "camera_delay = -1 .*0 or more"),
+        ({"camera_delay": 1.5}, "camera_delay = 1.5 .*0 or more"),
+        ({"events": ("missing",)}, "events = 'missing' .*names of methods"),
+        (
+            {"events": ("wide",), "wide": lambda _, state: np.zeros((len(state.held), 2), bool)},
+            r"wide\(\) = 'of shape \(7, 2\)'",
+        ),
+        ({"shaping": lambda _, state: {"a": [0.0] * len(state.held)}}, "an array"),
+        ({"sample": lambda *_: None}, r"sample\(\) = None .*a dictionary"),
+    ],
+)
+def test_a_wrong_attribute_of_a_task_is_refused_when_the_environment_is_made(
+    attributes: dict[str, Any], message: str
+) -> None:
+    task = type("Wrong", (Reach,), attributes)
+    with pytest.raises(ConfigurationError, match=message):
+        TPMEnv(task, engine="analytic")

@@ -8,8 +8,8 @@ return decides between equal successes.
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -138,25 +138,37 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
     def trainable(changes: dict[str, Any]) -> None:
         ray_tune.report({"score": _train(base, changes, folder, config.seed, here)})
 
-    if not ray.is_initialized():
-        # Ray refuses a number of CPUs for a cluster that is there.
-        address = os.environ.get("RAY_ADDRESS")
-        jobs = None if address else config.jobs
-        try:
-            ray.init(num_cpus=jobs, include_dashboard=False, log_to_driver=False)
-        except ConnectionError as error:
-            raise ConfigError(f"RAY_ADDRESS {address}: {error}; start Ray there") from error
     sampler, space = TPESampler(seed=config.seed), partial(_suggest, config.algo)
     search = OptunaSearch(space, metric="score", mode="max", sampler=sampler)
     settings = ray_tune.TuneConfig(
         search_alg=search, num_samples=config.trials, max_concurrent_trials=config.jobs
     )
     storage = ray_tune.RunConfig(name="ray", storage_path=str(folder), verbose=1)
-    results: Any = ray_tune.Tuner(trainable, tune_config=settings, run_config=storage).fit()
+    with _started(ray, config.jobs):
+        results: Any = ray_tune.Tuner(trainable, tune_config=settings, run_config=storage).fit()
     if not (ended := [result for result in results if result.error is None]):
         raise ConfigError(f"--folder {folder}: no training ended; see {folder}/000.log")
     best: Mapping[str, Any] = max(ended, key=lambda result: result.metrics["score"]).config
     return best
+
+
+@contextmanager
+def _started(ray: Any, jobs: int | None) -> Iterator[None]:
+    """Start Ray on this machine, or join the cluster at RAY_ADDRESS, if that is not done yet."""
+    if ray.is_initialized():
+        yield
+        return
+    address = os.environ.get("RAY_ADDRESS")
+    quiet = {"include_dashboard": False, "log_to_driver": False}
+    try:
+        # "local": not a cluster of others that runs here. Ray refuses a number of CPUs for one.
+        ray.init(**quiet) if address else ray.init("local", num_cpus=jobs, **quiet)
+    except ConnectionError as error:
+        raise ConfigError(f"RAY_ADDRESS {address}: {error}; start Ray there") from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
 
 
 def _suggest(algorithm: str, trial: Any) -> dict[str, Any]:
