@@ -14,6 +14,7 @@ from tpm_gym.envs.testing import check_env
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene
+from tpm_gym.tasks.task import Entry
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -131,6 +132,51 @@ def test_an_event_is_a_truth_value_with_a_name_of_its_own(sorting):
         tpm_gym.TPMEnv(wrong)
     wrong = type("Wrong", (sorting.Sort,), {"events": ("conditioning",), "conditioning": fast})
     with pytest.raises(ConfigurationError, match=r"events = .conditioning. .*names other than"):
+        tpm_gym.TPMEnv(wrong)
+
+
+def an_entry(scale, source):
+    """Return observed() with a further entry."""
+
+    def observed(self):
+        centre = (0.0,) * len(scale)
+        return (*self.robot_entries(), Entry("extra", "m", "-", centre, scale, source))
+
+    return observed
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [
+        ("observed", an_entry((1.0,), lambda state: state.fk_position), r"'extra' = .*\(n, 1\)"),
+        ("observed", an_entry((1.0,), lambda state: state.torque[:, 0]), r"'extra' = .*\(n, 1\)"),
+        ("observed", an_entry((0.0,) * 3, lambda state: state.torque), "'extra', scale = .*other"),
+        ("observed", an_entry((np.nan,) * 3, lambda state: state.torque), "'extra', scale = .*fin"),
+        ("observed", lambda self: (), "at least one Entry"),
+        ("gap", lambda self, a, b: np.zeros((len(a), 1)), r"gap\(\) = .*\(7, 1\).*\(n,\)"),
+        ("sample", lambda *_: None, r"sample\(\) = None .*the keys"),
+        ("tolerance", np.nan, "tolerance = nan .*positive"),
+        ("tolerance", -0.01, "tolerance = -0.01 .*positive"),
+        ("camera_delay", 1.5, "camera_delay = 1.5 .*whole number"),
+        ("goal_size", 3.0, "goal_size = 3.0 .*three for each"),
+        ("events", ("absent",), "'absent' .*methods"),
+        ("events", ("tolerance",), "'tolerance' .*methods"),
+        ("events", ("_hidden",), "'_hidden' .*begin with _"),
+        ("events", ("final_obs",), "'final_obs' .*names other than"),
+    ],
+)
+def test_values_that_would_go_wrong_later_are_refused_early(sorting, part, value, message):
+    wrong = type("Wrong", (sorting.Sort,), {part: value})
+    with pytest.raises(ConfigurationError, match=message):
+        tpm_gym.TPMEnv(wrong, engine="analytic")
+
+
+def test_an_event_has_one_value_for_each_robot(sorting):
+    def both(self, state):
+        return state.object_position[..., 2] > 0.1
+
+    wrong = type("Wrong", (sorting.Sort,), {"events": ("both",), "both": both})
+    with pytest.raises(ConfigurationError, match=r"both\(\) = .*\(7, 2\)"):
         tpm_gym.TPMEnv(wrong)
 
 

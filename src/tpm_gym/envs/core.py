@@ -51,6 +51,9 @@ INFO: Final = {
 }
 """Types of the entries of every info by name; the task's events are further entries."""
 
+_TAKEN: Final = ("randomisation", "final_obs", "final_info", "episode")
+"""Further entries that this package and Gymnasium add to infos."""
+
 Observation = dict[str, Any]  # arrays of float32
 Report = tuple[Observation, FloatArray, dict[str, Any]]
 """Observation, reward (n,) and info, whose values are arrays (n,)."""
@@ -115,7 +118,7 @@ class Core:
         self.task = make_task(
             task, machine=machine, reward=reward, goals=goals, penalty_weight=penalty_weight
         )
-        checking.check(self.task, taken=tuple(INFO))
+        checking.check(self.task, taken=(*INFO, *_TAKEN))
         if control not in self.task.controls:
             valid = f"{' or '.join(map(repr, self.task.controls))} for {type(self.task).__name__}"
             raise ConfigurationError("control", control, valid)

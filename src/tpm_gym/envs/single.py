@@ -155,7 +155,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     Past a parallel singularity the encoders no longer determine the platform's position. Then the
     penalty is 1 and the episode is truncated. No action of the nominal robot with ideal drives
-    leads past one.
+    leads past one, except in Cycle: there, hostile actions at full speed can ask for more torque
+    than the motors have. ``shield=True`` prevents it.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from tpm_gym.arrays import finite, is_number, is_whole
+from tpm_gym.arrays import finite
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
@@ -35,18 +34,14 @@ def check(task: Task, taken: Sequence[str] = ()) -> None:
         ConfigurationError: If there is no start, an attribute is not possible, an event's name is
             taken, or a result is wrong; the error names the attribute or the method.
     """
-    if not is_number(task.tolerance) or not 0 < task.tolerance < math.inf:
-        raise ConfigurationError("tolerance", task.tolerance, "a number above 0, in m")
-    if not is_whole(task.camera_delay, 0):
-        valid = "a whole number of control steps, 0 or more"
-        raise ConfigurationError("camera_delay", task.camera_delay, valid)
     known = list(taken)
     for event in task.events:
         if event in known:
             raise ConfigurationError("events", event, f"names other than {', '.join(known)}")
+        if event.startswith("_"):
+            raise ConfigurationError("events", event, "names that do not begin with _")
         if not callable(getattr(task, event, None)):
-            valid = f"names of methods of {type(task).__name__}"
-            raise ConfigurationError("events", event, valid)
+            raise ConfigurationError("events", event, "names of methods of the task")
         known.append(event)
     task.start([np.random.default_rng(0)])
     several = _example_states(task.machine, task.scene)
@@ -89,11 +84,25 @@ def _check_shapes(task: Task, state: State) -> None:
         if not isinstance(values, np.ndarray):
             raise ConfigurationError(f"shaping()[{name!r}]", type(values), "an array (n,)")
     for event in task.events:
-        happened = np.asarray(getattr(task, event)(state))
-        if happened.dtype != np.bool_:
-            raise ConfigurationError(f"{event}()", f"of type {happened.dtype}", "(n,) bool")
-        if happened.ndim > 1:
-            raise ConfigurationError(f"{event}()", f"of shape {happened.shape}", "(n,) bool")
+        values = np.asarray(getattr(task, event)(state))
+        if (kind := values.dtype) != np.bool_:
+            raise ConfigurationError(f"{event}()", f"of type {kind}", "(n,) bool")
+        _require_shape(f"{event}()", values, ())
+    for entry in task.entries:  # before observe(), whose compiled loops do not check lengths
+        seen = np.asarray(entry.source(state))
+        if seen.ndim == 2 and entry.columns is not None:
+            seen = seen[:, slice(*entry.columns)]
+        _require_shape(f"observed(), {entry.name!r}", seen, (len(entry.scale),))
+    gap = task.gap(task.achieved(state), np.zeros((_EXAMPLES, task.goal_size)))
+    _require_shape("gap()", gap, ())
+
+
+def _require_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
+    """Refuse values that are not of this shape for each robot."""
+    if np.shape(values) != (_EXAMPLES, *shape):
+        wanted = f"(n, {shape[0]})" if shape else "(n,)"
+        valid = f"values {wanted} for n robots, each from its own row; reduce by axis=-1"
+        raise ConfigurationError(name, f"of shape {np.shape(values)} for {_EXAMPLES}", valid)
 
 
 def _equal(row: Any, single: Any) -> bool:

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, is_number
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, is_number, is_whole
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
@@ -125,10 +125,14 @@ class Task(ABC):
         )
         if isinstance(penalty_weight, bool) or self.penalty_weight < 0:
             raise ConfigurationError("penalty_weight", penalty_weight, "a number, 0 or more")
-        if self.goal_size < 3 or self.goal_size % 3:
+        if not is_whole(self.goal_size, 3) or self.goal_size % 3:
             raise ConfigurationError("goal_size", self.goal_size, "three for each point")
         if not (is_number(self.control_period) and self.control_period > 0):
             raise ConfigurationError("control_period", self.control_period, "a positive number")
+        if not (is_number(self.tolerance) and self.tolerance > 0):
+            raise ConfigurationError("tolerance", self.tolerance, "a positive number")
+        if not is_whole(self.camera_delay, 0):
+            raise ConfigurationError("camera_delay", self.camera_delay, "a whole number, 0 or more")
         self.machine, self.reward, self.goals = machine, reward, goals
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
@@ -141,6 +145,13 @@ class Task(ABC):
 
     def _set_entries(self) -> None:
         self.entries = self.observed()
+        if not self.entries:
+            raise ConfigurationError("observed()", self.entries, "at least one Entry")
+        for entry in self.entries:
+            label, shape = f"observed(), {entry.name!r}", (len(entry.centre),)
+            finite(f"{label}, centre", entry.centre, shape, ConfigurationError)
+            if not finite(f"{label}, scale", entry.scale, shape, ConfigurationError).all():
+                raise ConfigurationError(f"{label}, scale", entry.scale, "numbers other than 0")
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
         # The source of adjacent entries is read only once.
@@ -285,12 +296,12 @@ class Task(ABC):
         """
         chosen = {} if options is None else self._chosen(options)
         given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
-        starts: object = self.sample(rngs, dict(given))
-        if not isinstance(starts, dict):
-            raise ConfigurationError("sample()", starts, "a dictionary of arrays, by name")
-        if starts.keys() != self._sizes.keys():
+        starts = self.sample(rngs, dict(given))
+        found: object = starts
+        if not isinstance(found, Mapping) or starts.keys() != self._sizes.keys():
+            given_back = list(found) if isinstance(found, Mapping) else found
             valid = f"the keys {', '.join(self._sizes)}"
-            raise ConfigurationError("sample()", list(starts), valid)
+            raise ConfigurationError("sample()", given_back, valid)
         for name, size in self._sizes.items():
             label, shape = f"sample()[{name!r}]", (len(rngs), size)
             starts[name] = finite(label, starts[name], shape, ConfigurationError)
