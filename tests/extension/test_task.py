@@ -154,7 +154,12 @@ def an_entry(scale, source):
         ("observed", an_entry((np.nan,) * 3, lambda state: state.torque), "'extra', scale = .*fin"),
         ("observed", lambda self: (), "at least one Entry"),
         ("gap", lambda self, a, b: np.zeros((len(a), 1)), r"gap\(\) = .*\(7, 1\).*\(n,\)"),
+        ("sample", lambda *_: None, r"sample\(\) = None .*the keys"),
+        ("tolerance", np.nan, "tolerance = nan .*positive"),
+        ("tolerance", -0.01, "tolerance = -0.01 .*positive"),
+        ("camera_delay", 1.5, "camera_delay = 1.5 .*whole number"),
         ("goal_size", 3.0, "goal_size = 3.0 .*three for each"),
+        ("events", ("absent",), "'absent' .*methods"),
         ("events", ("tolerance",), "'tolerance' .*methods"),
         ("events", ("_hidden",), "'_hidden' .*begin with _"),
         ("events", ("final_obs",), "'final_obs' .*names other than"),
@@ -164,6 +169,15 @@ def test_values_that_would_go_wrong_later_are_refused_early(sorting, part, value
     wrong = type("Wrong", (sorting.Sort,), {part: value})
     with pytest.raises(ConfigurationError, match=message):
         tpm_gym.TPMEnv(wrong, engine="analytic")
+
+
+def test_an_event_has_one_value_for_each_robot(sorting):
+    def both(self, state):
+        return state.object_position[..., 2] > 0.1
+
+    wrong = type("Wrong", (sorting.Sort,), {"events": ("both",), "both": both})
+    with pytest.raises(ConfigurationError, match=r"both\(\) = .*\(7, 2\)"):
+        tpm_gym.TPMEnv(wrong)
 
 
 def test_where_there_is_no_room_sampling_says_so(sorting):

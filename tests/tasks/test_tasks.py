@@ -363,18 +363,18 @@ def test_blocks_of_a_stack_start_beside_each_other(machine):
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"tolerance": float("nan")}, "tolerance = nan .*above 0"),
-        ({"tolerance": -0.01}, "tolerance = -0.01 .*above 0"),
-        ({"tolerance": "x"}, "tolerance = 'x' .*above 0"),
+        ({"tolerance": float("nan")}, "tolerance = nan .*positive"),
+        ({"tolerance": -0.01}, "tolerance = -0.01 .*positive"),
+        ({"tolerance": "x"}, "tolerance = 'x' .*positive"),
         ({"camera_delay": -1}, "camera_delay = -1 .*0 or more"),
         ({"camera_delay": 1.5}, "camera_delay = 1.5 .*0 or more"),
         ({"events": ("missing",)}, "events = 'missing' .*names of methods"),
         (
             {"events": ("wide",), "wide": lambda _, state: np.zeros((len(state.held), 2), bool)},
-            r"wide\(\) = 'of shape \(7, 2\)'",
+            r"wide\(\) = .*\(7, 2\)",
         ),
         ({"shaping": lambda _, state: {"a": [0.0] * len(state.held)}}, "an array"),
-        ({"sample": lambda *_: None}, r"sample\(\) = None .*a dictionary"),
+        ({"sample": lambda *_: None}, r"sample\(\) = None .*the keys"),
     ],
 )
 def test_a_wrong_attribute_of_a_task_is_refused_when_the_environment_is_made(

@@ -129,6 +129,10 @@ class Task(ABC):
             raise ConfigurationError("goal_size", self.goal_size, "three for each point")
         if not (is_number(self.control_period) and self.control_period > 0):
             raise ConfigurationError("control_period", self.control_period, "a positive number")
+        if not (is_number(self.tolerance) and self.tolerance > 0):
+            raise ConfigurationError("tolerance", self.tolerance, "a positive number")
+        if not is_whole(self.camera_delay, 0):
+            raise ConfigurationError("camera_delay", self.camera_delay, "a whole number, 0 or more")
         self.machine, self.reward, self.goals = machine, reward, goals
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
@@ -292,12 +296,12 @@ class Task(ABC):
         """
         chosen = {} if options is None else self._chosen(options)
         given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
-        starts: object = self.sample(rngs, dict(given))
-        if not isinstance(starts, dict):
-            raise ConfigurationError("sample()", starts, "a dictionary of arrays, by name")
-        if starts.keys() != self._sizes.keys():
+        starts = self.sample(rngs, dict(given))
+        found: object = starts
+        if not isinstance(found, Mapping) or starts.keys() != self._sizes.keys():
+            given_back = list(found) if isinstance(found, Mapping) else found
             valid = f"the keys {', '.join(self._sizes)}"
-            raise ConfigurationError("sample()", list(starts), valid)
+            raise ConfigurationError("sample()", given_back, valid)
         for name, size in self._sizes.items():
             label, shape = f"sample()[{name!r}]", (len(rngs), size)
             starts[name] = finite(label, starts[name], shape, ConfigurationError)

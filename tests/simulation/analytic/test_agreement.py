@@ -54,8 +54,8 @@ def column(states: Any, episodes: int, name: str) -> FloatArray:
     ("policy", "rate", "bound"),
     [
         ("expert", 250, 2e-3),  # 0.9e-3 to 1.5e-3
-        ("random", 250, 1.5e-2),  # 0.7e-2 to 0.9e-2
-        ("random", 1000, 4e-3),  # 0.3e-2
+        ("random", 250, 2.5e-2),  # 0.5e-2 to 1.6e-2 in eight triples of episodes
+        ("random", 1000, 8e-3),  # 0.2e-2 to 0.6e-2
     ],
 )
 def test_with_free_hands_it_feels_and_sees_what_pybullet_does(policy, rate, bound):
