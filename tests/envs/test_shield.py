@@ -13,11 +13,13 @@ import tpm_gym
 from tpm_gym.arrays import FloatArray
 from tpm_gym.envs.shield import Shield
 from tpm_gym.envs.testing import bits, fingerprint, random_episode
+from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM, Machine
 from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.tasks.control import Control, make_control
 from tpm_gym.tasks.expert import Expert
+from tpm_gym.tasks.reach import Reach
 
 CLOSE = 0.003  # in units of the action
 
@@ -245,6 +247,17 @@ def test_the_margin_is_enough_for_servo_drives(machine: str) -> None:
 def test_other_values_are_refused(value: Any) -> None:
     with pytest.raises(ConfigurationError, match="shield"):
         gym.make("TPMReach-v0", engine="analytic", shield=value)
+
+
+def test_short_control_periods_need_accelerations() -> None:
+    # Else torques are limited, and robots fall below the safe conditioning.
+    quick = type("Quick", (Reach,), {"control_period": 0.01})
+    with pytest.raises(ConfigurationError, match=r"shield = True .*accelerations"):
+        tpm_gym.TPMEnv(quick, engine="analytic", shield=True)
+    limits = (20.0, 5.0, 20.0), (10.0, 2.0, 10.0)
+    steady = type("Steady", (quick,), {"accelerations": limits})
+    envs: Any = TPMVectorEnv(steady, num_envs=64, engine="analytic", shield=True)
+    assert push(envs, 200).min() >= 0.08
 
 
 def test_a_number_is_the_conditioning_that_is_kept() -> None:

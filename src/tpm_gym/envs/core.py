@@ -18,7 +18,7 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, drives_and_randomisation
 from tpm_gym.simulation.randomisation import NOMINAL, Randomisation
 from tpm_gym.simulation.simulation import Simulation, Snapshot
-from tpm_gym.simulation.state import State
+from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks import checking
 from tpm_gym.tasks.control import Follower, make_control
 from tpm_gym.tasks.registry import make_task
@@ -161,6 +161,10 @@ class Core:
     def _make_shield(self, shield: bool | float) -> Shield | BrakingShield:
         from tpm_gym.envs.shield import make_shield  # imports Numba
 
+        if self._follower is None and self.task.control_period < CONTROL_PERIOD:
+            # The limit of the step alone lets commands reverse faster than the motors can.
+            valid = "False, or a task that sets accelerations, as its control period is shorter"
+            raise ConfigurationError("shield", shield, f"{valid} than {CONTROL_PERIOD} s")
         exact = self.drive is None and not self._altered
         return make_shield(shield, self.machine, self.control, self._follower, exact)
 

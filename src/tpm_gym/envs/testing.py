@@ -415,8 +415,10 @@ def survives_json(make: Make) -> None:
 
 
 def is_solved_by_its_expert(make: Make) -> None:
-    """Play the task's scripted controller; tasks without a plan have none to check."""
+    """Play the task's scripted controller, which needs a plan and the block's entries."""
     with closing(make()) as env:
+        if "pixels" in getattr(env.observation_space, "spaces", ()):
+            return
         expert = Expert(env)
         for seed in range(2):
             observation, info = env.reset(seed=seed)

@@ -85,7 +85,8 @@ class Task(ABC):
         events: Names of methods of the task. ``info`` has their results for the state, (n,) bool,
             and an evaluation the share of episodes in which each was true after a step.
         control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
-            scaled to it.
+            scaled to it. In shorter periods commands can ask for more torque than the motors have,
+            unless :attr:`accelerations` are set; a shield requires them then.
         accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
             and its deceleration before the ends of the region, m/s^2; None for any.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
