@@ -38,7 +38,7 @@ BATCH = 250
 
 
 class Cell(NamedTuple):
-    """One noise in one engine at one time step."""
+    """Noise, engine and time step of one test."""
 
     noise: float
     engine: str
@@ -97,7 +97,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description="Success at two time steps, in each engine.")
+    parser = argparse.ArgumentParser(description="Success of a policy in each engine.")
     parser.add_argument("--policy", default=ENV_ID, help="id of a published policy, or a file")
     parser.add_argument("--milliseconds", type=float, nargs="+", default=MILLISECONDS)
     parser.add_argument("--noises", type=float, nargs="+", default=NOISES)

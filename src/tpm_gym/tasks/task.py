@@ -298,11 +298,9 @@ class Task(ABC):
         chosen = {} if options is None else self._chosen(options)
         given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
         starts = self.sample(rngs, dict(given))
-        found: object = starts
-        if not isinstance(found, Mapping) or starts.keys() != self._sizes.keys():
-            given_back = list(found) if isinstance(found, Mapping) else found
-            valid = f"the keys {', '.join(self._sizes)}"
-            raise ConfigurationError("sample()", given_back, valid)
+        names: object = list(starts) if isinstance(starts, Mapping) else starts
+        if not isinstance(starts, Mapping) or starts.keys() != self._sizes.keys():
+            raise ConfigurationError("sample()", names, f"the keys {', '.join(self._sizes)}")
         for name, size in self._sizes.items():
             label, shape = f"sample()[{name!r}]", (len(rngs), size)
             starts[name] = finite(label, starts[name], shape, ConfigurationError)
