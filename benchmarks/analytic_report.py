@@ -68,6 +68,24 @@ def _times(row: dict[str, Any]) -> str:
     return _quartiles(row["ratio"], "{:.0f}" if min(row["ratio"]) >= 10 else "{:.1f}")
 
 
+def _threads(rows: list[dict[str, Any]]) -> Iterator[str]:
+    yield from table(
+        ["drives", "environments", "one thread, steps/s", "two threads, steps/s", "ratio"],
+        [
+            [
+                row["drive"],
+                f"{row['count']:,}",
+                _quartiles(row["one"], "{:,.0f}"),
+                _quartiles(row["two"], "{:,.0f}"),
+                _quartiles(
+                    [two / one for one, two in zip(row["one"], row["two"], strict=True)], "{:.2f}"
+                ),
+            ]
+            for row in rows
+        ],
+    )
+
+
 def _torques(rows: list[dict[str, Any]]) -> Iterator[str]:
     yield from table(
         [
@@ -108,10 +126,11 @@ def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 _TITLES = {
     "speed": "Speed, steps of environments a second, medians and quartiles of rounds.",
+    "threads": f"Threads, {PICK}, steps of environments a second.",
     "torques": "Torques, with free hands.",
     "success": "Success at the end, of the same episodes.",
 }
-_TABLES = {"speed": _speed, "torques": _torques, "success": _success}
+_TABLES = {"speed": _speed, "threads": _threads, "torques": _torques, "success": _success}
 
 
 def _quartiles(values: list[float], form: str) -> str:

@@ -7,6 +7,8 @@ Speed: environment steps per second with uniform random actions, resets included
 turns: the analytic engine with several numbers of environments, with the torques of no, the last or
 every time step, and with servo drives; PyBullet; panda-gym. Ratios compare blocks of one round.
 
+Threads: the analytic engine with one and with two threads, in turns.
+
 Torques: both engines get the same actions with nothing to touch, at several time steps. Torques,
 observations and conditioning are compared.
 
@@ -43,6 +45,8 @@ from tpm_gym.learning.rollout import TEST_SEED
 PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReach-v0"
 PEER = "PandaPickAndPlace-v3"
 COUNTS = (1, 16, 256, 1024, 4096)
+THREADED = {"ideal": (1024, 4096, 16384, 65536), "servo": (1024, 4096, 16384)}
+"""Numbers of environments that two threads step, by drive."""
 ROUNDS, SINGLE, STEPS = 7, 300, 50
 """Rounds of timing, control steps of a block of one environment, steps of an episode."""
 
@@ -74,6 +78,26 @@ def speeds(rounds: int, counts: Sequence[int]) -> dict[str, dict[str, Any]]:
                 found[name].append(rate)
         print(f"round {number + 1} of {rounds}", file=sys.stderr)
     return {name: {"rates": rates, "ratio": _ratio(name, found)} for name, rates in found.items()}
+
+
+def threads(rounds: int) -> list[dict[str, Any]]:
+    """Measure steps per second with one and with two threads, in turns."""
+    rows = []
+    for drive, counts in THREADED.items():
+        for count in counts:
+            print(f"threads: {drive}, {count}", file=sys.stderr)
+            found: dict[str, list[float]] = {"one": [], "two": []}
+            torques = "none" if drive == "ideal" else "last"
+            one, two = (
+                _many(PICK, count, torques, drive=drive, num_threads=number) for number in (1, 2)
+            )
+            for number in range(-1, rounds):  # the first is not counted
+                rates = one(number + 1), two(number + 1)
+                if number >= 0:
+                    found["one"].append(rates[0])
+                    found["two"].append(rates[1])
+            rows.append({"drive": drive, "count": count, **found})
+    return rows
 
 
 def _ratio(name: str, found: dict[str, list[float]]) -> list[float] | None:
@@ -225,7 +249,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Speed and accuracy of the analytic engine.")
     parser.add_argument("--quick", action="store_true", help="a minute or two; writes no files")
     parser.add_argument("--episodes", type=int, default=1000, help="of each row of success")
-    parser.add_argument("--part", choices=("speed", "torques", "success"), help="only this one")
+    parser.add_argument(
+        "--part", choices=("speed", "threads", "torques", "success"), help="only this one"
+    )
     parser.add_argument("--redraw", action="store_true", help="picture and page from the record")
     options = parser.parse_args()
     if options.redraw:
@@ -238,6 +264,7 @@ def main() -> None:
             "rates": speeds(2 if quick else ROUNDS, COUNTS[3:4] if quick else COUNTS),
             "evaluation": [evaluation() for _ in range(2 if quick else ROUNDS)],
         },
+        "threads": lambda: threads(2 if quick else ROUNDS),
         "torques": lambda: torques(2 if quick else 20, (250,) if quick else (250, 500, 1000, 2000)),
         "success": lambda: success(10 if quick else options.episodes),
     }

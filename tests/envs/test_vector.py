@@ -1,6 +1,7 @@
 """Vector environments: as Gymnasium wants them, and each row as the environment alone."""
 
 import copy
+import os
 import pickle
 from collections.abc import Callable
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from episodes import EVERYTHING, OF_SERVOS, bits
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from processes import PYTHON, printed_by
 
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import (
@@ -294,3 +296,23 @@ def test_a_refused_reset_seeds_nothing(wrong):
                 envs.reset(**wrong)
         found.append((envs.step(np.zeros((4, 4)))[0], envs.reset()[0], envs.reset(seed=7)[0]))
     assert_same(*found)
+
+
+MANY = """
+import time
+import gymnasium as gym
+import tpm_gym
+envs = gym.make_vec("TPMPickAndPlace-v0", num_envs=16384, engine="analytic")
+envs.reset(seed=0)
+envs.step(envs.action_space.sample())
+own, all_threads = time.thread_time(), time.process_time()
+for _ in range(10):
+    envs.step(envs.action_space.sample())
+print((time.process_time() - all_threads) / (time.thread_time() - own))
+"""
+
+
+def test_one_thread_keeps_only_one_core_busy() -> None:
+    """Threads of BLAS, which numpy wakes for long scalar products, would occupy the others."""
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "2")
+    assert float(printed_by(PYTHON, "-c", MANY, env={**os.environ, **threads})) < 1.1

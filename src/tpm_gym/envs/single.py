@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from typing import Any
 
 import gymnasium as gym
@@ -320,14 +319,11 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If a result of the task is not finite.
         """
         core = self._core
-        plain = type(action) is np.ndarray and action.dtype.char in "df"
-        # The scalar product is faster than np.isfinite(); if it overflows, finite() decides.
-        if not plain or action.shape != self._action or not isfinite(np.vdot(action, action)):
-            action = finite("action", action, self._action, ActionError)
+        values = finite("action", action, self._action, ActionError)
         state = core.state
         if state.assembly_mode_changed[0] or state.working_mode_changed[0]:
             raise ModeChangeError("assembly" if state.assembly_mode_changed[0] else "working")
-        core.step(action.astype(np.float64)[None], _ROW)
+        core.step(values[None], _ROW)
         observation, reward, info = _row(*core.report())
         truncated = info["assembly_mode_changed"] or info["working_mode_changed"]
         if self.render_mode == "human":

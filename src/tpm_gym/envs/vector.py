@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -222,12 +221,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ActionError: If the actions have the wrong shape or are not finite.
             EpisodeError: Before reset, after close, or where an episode ended and is not reset.
         """
-        plain = type(actions) is np.ndarray and actions.dtype.char in "df"
-        shape = self._shape
-        if not plain or actions.shape != shape or not isfinite(np.vdot(actions, actions)):
-            actions = finite("actions", actions, shape, ActionError)
+        values = finite("actions", actions, self._shape, ActionError)
         self._require_running()
-        values = actions.astype(np.float64)
         if len(self._parts) == 1:
             observation, reward, ended, info = self._parts[0].step(values)
         else:

@@ -10,7 +10,6 @@ positions theta are in rad (m for a slide). Results are NaN in rows without a so
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
@@ -236,7 +235,7 @@ class Machine(ABC):
             UnreachableError: If a position is out of reach.
         """
         theta = self.inverse(position)
-        if math.isnan(np.vdot(theta, theta)):  # faster than isnan().any()
+        if np.isnan(theta).any():
             raise self.unreachable(_first(position, np.isnan(theta[..., 0])))
         return theta
 
@@ -248,7 +247,7 @@ class Machine(ABC):
             SingularityError: If it is at a parallel singularity.
         """
         reading = self.evaluate(theta, built)
-        if math.isnan(np.vdot(reading.conditioning, reading.conditioning)):
+        if np.isnan(reading.conditioning).any():
             raise self.unassembled(_first(theta, np.isnan(reading.conditioning)))
         return reading
 

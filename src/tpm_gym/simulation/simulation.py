@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -272,7 +271,7 @@ class Simulation:
             theta = theta + self._bias + last
             rates = rates + (last - before) / self.control_period
         position, jacobian, conditioning, _ = self.machine.evaluate(theta)
-        if math.isnan(np.vdot(conditioning, conditioning)):  # faster than isnan().any()
+        if np.isnan(conditioning).any():
             # With bias and noise, the encoders may report joint positions at which no assembly
             # exists. Then the last valid result is kept, as a real controller would do.
             lost = np.isnan(conditioning)
