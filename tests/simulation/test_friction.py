@@ -241,6 +241,25 @@ def test_a_struck_block_slides_and_does_not_take_off(engine, overlap):
     assert max(state.object_position[0, 2] for state in states) < half + 0.0015
 
 
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
+@pytest.mark.parametrize("sideways", [-0.002, 0.002])  # m in a control period
+def test_a_side_that_the_lip_pushes_goes_along_with_the_lip(engine, sideways):
+    """[The side stayed behind: in a steady push PyBullet's lip had no friction.]"""
+    mount, half = PAPER_TPM.mount, BLOCK.height / 2
+    x, y, _ = mount.to_world(PAPER_TPM.home)
+    place = np.array([x, y, 2 * half - 0.010 + CUP.length])
+    simulation = Alone(Scene(objects=(BLOCK,)), engine=engine)
+    theta = PAPER_TPM.inverse(mount.to_paper(place))
+    simulation.reset(theta, {BLOCK.name: (x + 0.05, y, half)})
+    for step in range(8):
+        place = place + (0.012, 0.0 if step < 6 else sideways, 0.0)
+        state = simulation.move(mount.to_paper(place))
+    arm = state.platform_position - state.object_position[0] + (CUP.radius, 0.0, 0.0)
+    turning = np.cross(state.object_angular_velocity[0], arm)
+    side = state.object_velocity[0] + turning
+    assert side[1] == pytest.approx(sideways / 0.040, rel=0.1)
+
+
 @each_engine
 def test_a_resting_block_neither_sinks_nor_moves(engine):
     simulation, heights = start(engine, BLOCK), list[float]()

@@ -319,11 +319,13 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If a result of the task is not finite.
         """
         core = self._core
-        values = finite("action", action, self._action, ActionError)
+        plain = type(action) is np.ndarray and action.dtype.char in "df"
+        if not plain or action.shape != self._action or not np.isfinite(action).all():
+            action = finite("action", action, self._action, ActionError)
         state = core.state
         if state.assembly_mode_changed[0] or state.working_mode_changed[0]:
             raise ModeChangeError("assembly" if state.assembly_mode_changed[0] else "working")
-        core.step(values[None], _ROW)
+        core.step(action.astype(np.float64)[None], _ROW)
         observation, reward, info = _row(*core.report())
         truncated = info["assembly_mode_changed"] or info["working_mode_changed"]
         if self.render_mode == "human":

@@ -221,8 +221,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ActionError: If the actions have the wrong shape or are not finite.
             EpisodeError: Before reset, after close, or where an episode ended and is not reset.
         """
-        values = finite("actions", actions, self._shape, ActionError)
+        plain = type(actions) is np.ndarray and actions.dtype.char in "df"
+        if not plain or actions.shape != self._shape or not np.isfinite(actions).all():
+            actions = finite("actions", actions, self._shape, ActionError)
         self._require_running()
+        values = actions.astype(np.float64)
         if len(self._parts) == 1:
             observation, reward, ended, info = self._parts[0].step(values)
         else:

@@ -10,7 +10,10 @@ from tpm_gym.compiling import compilable, compiled, kept
 from tpm_gym.simulation.drives import References
 from tpm_gym.simulation.engine import transform
 from tpm_gym.simulation.vectors import (
+    cross,
+    dot,
     inverted,
+    length,
     onto,
     page_row,
     plus,
@@ -252,6 +255,57 @@ def truth(
     own = frames[7 * platform :]
     sine = np.sqrt(own[4] * own[4] + own[5] * own[5] + own[6] * own[6])
     return np.sqrt(squared), _placed(own, point), 2 * np.arcsin(min(1.0, sine))
+
+
+@kept
+def friction_force(
+    point: Vector,
+    normal: Vector,
+    place: Vector,
+    motion: tuple[Vector, Vector, Vector],
+    before: Vector,
+    most: float,
+    mass: float,
+    moments: Vector,
+    step: float,
+) -> tuple[Vector, Vector, Vector]:
+    """Compute Coulomb's friction on a block for the next time step, from the slip in the last.
+
+    The force ends the slip within a few time steps. A sticking contact needs a force without slip.
+    It is the sum of earlier forces.
+
+    Args:
+        point: Point of contact, m.
+        normal: Unit vector towards the block.
+        place: Centre of the block, m.
+        motion: Velocity (m/s) and angular velocity (rad/s) of the block, velocity of the other.
+        before: Sum of earlier forces, N.
+        most: Largest friction, N; none if negative.
+        mass: Mass of the block, kg.
+        moments: Principal moments of inertia of the block, which is assumed upright, kg m^2.
+        step: Time step, s.
+
+    Returns:
+        The friction on the block and on the other body, and the sum of earlier forces then, N.
+    """
+    arm = plus(point, place, -1.0)
+    slip = plus(plus(motion[0], cross(motion[1], arm)), motion[2], -1.0)
+    slip = plus(slip, normal, -dot(slip, normal))
+    speed = max(length(slip), 1e-12)
+    x, y, z = cross(arm, plus((0.0, 0.0, 0.0), slip, 1 / speed))
+    mobility = 1 / mass + x * x / moments[0] + y * y / moments[1] + z * z / moments[2]
+    ending = plus((0.0, 0.0, 0.0), slip, -1 / (mobility * step))
+    kept = plus(plus(before, normal, -dot(before, normal)), ending, 0.5)
+    kept = _at_most(kept, most)
+    force = _at_most(plus(kept, ending), most)
+    return force, plus((0.0, 0.0, 0.0), force, -1.0), kept
+
+
+@compiled
+def _at_most(vector: Vector, most: float) -> Vector:
+    """Return a vector, shortened to a length; zero for a negative length."""
+    share = min(1.0, max(most, 0.0) / max(length(vector), 1e-12))
+    return plus((0.0, 0.0, 0.0), vector, share)
 
 
 @compiled

@@ -98,7 +98,7 @@ class BulletEngine:
         self._cup = Cup(self.client, self.robot, self.bodies, scene.objects, self.time_step)
         tables, belts = self._scenery.tables, self._scenery.belts
         self._friction = Friction(
-            self.client, self.robot, self.bodies, tables, belts, scene.objects
+            self.client, self.robot, self.bodies, tables, belts, scene.objects, self.time_step
         )
 
     def alter(self, rows: IntArray, plants: Sequence[Plant]) -> None:

@@ -1,16 +1,21 @@
 """Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
-The solver limits the friction force of a contact to mu N along each of two directions. At 45
-degrees to these directions, friction is sqrt(2) times too strong, and it does not oppose the slip.
-On a level face the directions are the world's x and y, and Bullet can scale both limits for each
-body. For a slipping contact, this module scales them so that a corner of the box lies on the cone,
-opposite to the slip. For a sticking contact, the limit along x follows from the cone and the last
-force along y, and vice versa. Without a last force, the box lies inside the cone.
+**Level faces.** The solver limits the friction force of a contact to mu N along each of two
+directions. At 45 degrees to these directions, friction is sqrt(2) times too strong, and it does not
+oppose the slip. On a level face the directions are the world's x and y, and Bullet can scale both
+limits for each body. For a slipping contact, this module scales them so that a corner of the box
+lies on the cone, opposite to the slip. For a sticking contact, the limit along x follows from the
+cone and the last force along y, and vice versa. Without a last force, the box lies inside the cone.
+An object at rest that the lip comes near is expected to slip along the lip's way.
 
-Remaining errors, measured in ``tests/simulation/bullet/test_friction.py``: the direction lags by
-one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
+**Upright faces.** The solver takes N from a solution without friction. But a block that the lip
+pushes leans on the lip only because the table brakes it. Without friction N is 0, and the lip would
+be as slippery as ice. So this module adds the missing friction as a force, from the last N.
+
+Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
+by one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
 the slip direction of its middle, so that friction brakes a spinning block too little. Contacts
-between objects and contacts with upright faces keep the box.
+between objects keep the box, and upright ones have no friction in a steady push.
 """
 
 from __future__ import annotations
@@ -22,9 +27,11 @@ from typing import Any
 
 import pybullet
 
+from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
+from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import Block
 
 _LEAST = 0.02  # smallest scale; with 0, a row of the solver would vanish
@@ -32,9 +39,13 @@ _FAST = 1e-2  # m/s; a faster contact slips, whatever the last force was
 _SLIP = 1e-5  # m/s; in a slower contact, the next force is assumed along the last force
 _LITTLE = 1e-3  # (force / cone limit)^2; after a smaller force, the next may have any direction
 _STICKS = 0.98  # (force / cone limit)^2; with a smaller force the contact sticks
-_SAME = 0.01  # a smaller change of a scale is ignored, to save a call
+_SAME = 0.003  # a smaller change of a scale is ignored, to save a call
+_LEVEL = 0.7  # z of the normal; faces with less are upright
 _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction of the force
 _BOX = (1.0, 1.0)  # Bullet's default scales
+_Push = tuple[Vector, float]
+"""Sum of the forces that were added to a contact, and its largest friction at last, N."""
+_NONE: _Push = ((0.0, 0.0, 0.0), 0.0)
 
 
 class _Face:
@@ -59,6 +70,7 @@ class Friction:
             directions.
         belts: Body ids of the belts, one per object; empty without a belt.
         blocks: Objects of the scene.
+        time_step: Time step, s.
     """
 
     def __init__(
@@ -69,6 +81,7 @@ class Friction:
         tables: Sequence[int],
         belts: Sequence[int],
         blocks: Sequence[Block],
+        time_step: float,
     ) -> None:
         """Create the faces of tables, belts and cup, with Bullet's default friction."""
         # Without objects, there still is one table.
@@ -78,12 +91,16 @@ class Friction:
         self._cup = _Face(*robot.tool)
         number = client.number
         self._number, self._factor = number, 1.0
+        self._step = time_step
+        self._friction_force = loops().friction_force
+        self._pushes: list[_Push] = []
         self._active: list[int] = []
         self._resting: set[int] = set()
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
         """Set the scales of all faces to an unknown direction of the force."""
+        self._pushes = [_NONE] * len(self._bodies)
         for face in (self._cup, *self._belts, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet
             self._set(face, _UNKNOWN)
@@ -125,13 +142,18 @@ class Friction:
         number, cup = self._number, self._cup
         for index in self._active:
             body, table, block = self._bodies[index]
+            push, self._pushes[index] = self._pushes[index], _NONE
             if index != held and self._rests(index):
+                u, v, _ = self._lip_velocity()
+                if math.hypot(u, v) > _FAST:  # a strike would make the object slip along (u, v)
+                    self._set(table, _along(u, v))
                 continue
             points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with all other bodies
             if not points:
                 continue
             below = [point for point in points if point[2] == table.body]
-            above = [point for point in points if point[2] == cup.body and point[4] == cup.link]
+            lip = [point for point in points if point[2] == cup.body and point[4] == cup.link]
+            beside = [point for point in lip if abs(point[7][2]) < _LEVEL]
             (x, y, _), (p, q, _) = pybullet.getBaseVelocity(body, number)
             half, rough = block.height / 2, self._factor * block.friction
             if below:
@@ -141,21 +163,54 @@ class Friction:
                 if on_belt := [point for point in points if point[2] == belt.body]:
                     slip = x - half * q - belt.speed, y + half * p
                     self._set(belt, _scales(*slip, on_belt, rough))
-            if above and index != held:
-                state = pybullet.getLinkState(cup.body, cup.link, 1, 0, number)
-                u, v, _ = state[6]
+            if beside:
+                self._set(cup, _BOX)
+                self._pushes[index] = self._resist(body, beside, push, rough * CUP.friction)
+            elif lip and index != held:
+                u, v, _ = self._lip_velocity()
                 self._set(
-                    cup, _scales(x + half * q - u, y - half * p - v, above, rough * CUP.friction)
+                    cup, _scales(x + half * q - u, y - half * p - v, lip, rough * CUP.friction)
                 )
+
+    def _lip_velocity(self) -> Vector:
+        state = pybullet.getLinkState(self._cup.body, self._cup.link, 1, 0, self._number)
+        return state[6]  # type: ignore[no-any-return]  # PyBullet has no types
+
+    def _resist(self, body: int, points: Sequence[Any], last: _Push, coefficient: float) -> _Push:
+        """Apply the friction that the solver leaves out where the lip pushes a side of an object.
+
+        The points count as one contact at the point with the largest force. A blow lasts one time
+        step, and pushes no more in the next. So the smaller force of two time steps counts.
+
+        Args:
+            body: Body id of the object.
+            points: PyBullet's contact points.
+            last: The last push.
+            coefficient: Coulomb's coefficient of the contact.
+        """
+        number, cup, point = self._number, self._cup, max(points, key=lambda point: point[9])
+        normal = sum(point[9] for point in points)
+        solved = sum(math.hypot(point[10], point[12]) for point in points)
+        place, _ = pybullet.getBasePositionAndOrientation(body, number)
+        mass, _, moments, *_ = pybullet.getDynamicsInfo(body, -1, number)
+        motion = *pybullet.getBaseVelocity(body, number), self._lip_velocity()
+        contact, most = (point[5], point[7], place), coefficient * normal - solved
+        before, limit = last[0], min(last[1], most)
+        force, back, after = self._friction_force(
+            *contact, motion, before, limit, mass, moments, self._step
+        )
+        for pushed, push in (((body, -1), force), ((cup.body, cup.link), back)):
+            pybullet.applyExternalForce(*pushed, push, point[5], pybullet.WORLD_FRAME, number)
+        return after, most
 
     def _rests(self, index: int) -> bool:
         """Return whether an object has not moved since :meth:`prepare`, and the cup is not on it.
 
-        The friction of such an object needs no scaling. This check takes a third of the time.
+        This check takes a third of the time of scaling.
         """
-        body, table, _ = self._bodies[index]
-        if index not in self._resting or table.scales is not _UNKNOWN:
+        if index not in self._resting:
             return False
+        body, *_ = self._bodies[index]
         (x, y, _), _ = pybullet.getBaseVelocity(body, self._number)
         lip = self._cup.body, -1, self._cup.link, self._number
         if math.hypot(x, y) > _SLIP or pybullet.getContactPoints(body, *lip):
