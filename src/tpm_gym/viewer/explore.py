@@ -15,8 +15,6 @@ from tpm_gym.viewer.kinds import Kind, Posture
 from tpm_gym.viewer.scene import ROBOT
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Explore", "units"]
-
 _Label = TypeVar("_Label")
 
 

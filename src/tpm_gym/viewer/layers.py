@@ -19,8 +19,6 @@ from tpm_gym.viewer.kinds.kind import Found, Kind, Margin, Posture
 from tpm_gym.viewer.meshes import Mesh, cells_mesh
 from tpm_gym.viewer.scene import ROBOT
 
-__all__ = ["BEST", "LAYERS", "Layers", "colours"]
-
 Node = Any
 """Node of a viser scene."""
 

@@ -16,8 +16,6 @@ from tpm_gym.kinematics import WorkingMode
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import reachable
 
-__all__ = ["SURFACES", "Mesh", "cells_mesh", "clipped", "grid_mesh", "slice_mesh", "surface"]
-
 _AROUND = 33  # points along the half circle of link 7
 _SLACK = 1e-9  # share of l4 by which a leg may miss a boundary on which it lies
 _SMOOTHING = 4  # rounds

@@ -16,8 +16,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Play"]
-
 _COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118ab2")
 _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1

@@ -21,8 +21,6 @@ from tpm_gym.simulation.state import State
 from tpm_gym.tasks.expert import Expert
 from tpm_gym.tasks.task import Task
 
-__all__ = ["SCRIPTED", "Player", "installed_engines", "policies_for"]
-
 SCRIPTED: Final = ("expert", "random")
 _PACKAGES: Final = {"pybullet": "pybullet", "mujoco": "mujoco"}
 

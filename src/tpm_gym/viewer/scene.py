@@ -19,8 +19,6 @@ from tpm_gym.mechanism.urdf import COLOURS
 from tpm_gym.simulation.stage import BELT, FLOOR, PATCH_HEIGHT, TABLE, painted
 from tpm_gym.simulation.state import Patch, Scene, State
 
-__all__ = ["ROBOT", "TASK_NODES", "RobotScene", "colour", "set_camera"]
-
 ROBOT: Final = "/robot"
 """Node whose frame is the machine's frame; everything in that frame hangs below it."""
 

@@ -12,8 +12,6 @@ from viser import ViserServer
 from tpm_gym.arrays import is_whole
 from tpm_gym.errors import ConfigurationError
 
-__all__ = ["start", "stop"]
-
 _TRIES = 100
 _TAKEN = errno.EADDRINUSE, errno.EACCES
 

@@ -18,8 +18,6 @@ from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.scene import ROBOT, TASK_NODES, RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Viewer"]
-
 
 class Viewer:
     """Page with a robot that can be dragged, and that plays episodes.
