@@ -31,18 +31,18 @@ _ASPECTS: Final = (
     (46, 160, 67), (219, 132, 0), (17, 138, 178), (191, 64, 160), (140, 150, 30), (99, 110, 250),
     (200, 80, 60), (0, 150, 136),
 )  # fmt: skip
-_MAP: Final = np.array(
+MAP: Final = np.array(
     [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], dtype=float
 )
+"""Colours of the conditioning, evenly spaced from 0 to :data:`BEST`."""
 BEST: Final = 0.4
 """Conditioning at the end of the colour map."""
 
 
 def colours(values: FloatArray) -> NDArray[np.uint8]:
     """Return colours (..., 3) of conditionings (...,)."""
-    place = np.clip(values / BEST, 0.0, 1.0) * (len(_MAP) - 1)
-    parts = [np.interp(place, range(len(_MAP)), _MAP[:, k]) for k in range(3)]
-    return np.stack(parts, axis=-1).astype(np.uint8)
+    stops = np.linspace(0.0, BEST, len(MAP))
+    return np.stack([np.interp(values, stops, part) for part in MAP.T], axis=-1).astype(np.uint8)
 
 
 class Layers:
