@@ -54,6 +54,8 @@ def main(words: Sequence[str] | None = None) -> None:
     about = "Train and test policies for the robot of tpm_gym."
     options: Any = {"config": (tyro.conf.FlagCreatePairsOff,), "args": words}
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, **options)
+    # Without a handler, Python would end at once and leave temporary files.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     stopped_by = None
     try:
         if isinstance(command, EvaluationConfig):
