@@ -79,12 +79,16 @@ def main(words: Sequence[str] | None = None) -> None:
                 print(tune.tune(command))
             case ExportConfig():
                 print(f"exporting {command.model} and comparing its actions ...", flush=True)
+                evaluation = command.evaluation
                 policy = export.convert(
-                    command.model, command.out, trust_pickle=command.trust_pickle
+                    command.model,
+                    command.out,
+                    trust_pickle=command.trust_pickle,
+                    evaluation=evaluation,
                 )
                 print(policy)
-                if command.evaluation is not None:
-                    print(model_card.write(policy, command.evaluation))
+                if evaluation is not None:
+                    print(model_card.write(policy, evaluation))
     except TPMError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:
