@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional, subcommand
 
-from tpm_gym import TPMError
+from tpm_gym import TPMError, learning
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, unset
 from tpm_gym.learning.datasets import CollectConfig, collect
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.tune import TuneConfig
+from tpm_gym.learning.tune import TuneConfig, tune
 from tpm_gym.viewer import ViewConfig, run
 
 
@@ -58,26 +58,22 @@ def main(words: Sequence[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     stopped_by = None
     try:
-        if isinstance(command, EvaluationConfig):
-            evaluate(command)
-            return
-        if isinstance(command, ViewConfig):
-            run(command)
-            return
-        if isinstance(command, CollectConfig):
-            collect(command)
-            return
-        # Imported here, since they need PyTorch.
-        from tpm_gym.learning import export, model_card, training, tune
-
         match command:
             case TrainingConfig():
-                stopped_by = training.train(command)
+                stopped_by = learning.train(command)
             case ResumeConfig():
-                stopped_by = training.resume(command)
+                stopped_by = learning.resume(command)
+            case EvaluationConfig():
+                evaluate(command)
+            case CollectConfig():
+                collect(command)
             case TuneConfig():
-                print(tune.tune(command))
+                print(tune(command))
+            case ViewConfig():
+                run(command)
             case ExportConfig():
+                from tpm_gym.learning import export, model_card  # PyTorch is needed here only
+
                 print(f"exporting {command.model} and comparing its actions ...", flush=True)
                 evaluation = command.evaluation
                 policy = export.convert(
