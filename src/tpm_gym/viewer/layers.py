@@ -58,7 +58,6 @@ class Layers:
         self._scene, self._kind = scene, kind
         self._nodes: dict[str, list[Node]] = {}
         self._keys: dict[str, Any] = {}
-        self.margin: Margin | None = None
 
     def around(self, posture: Posture) -> Mapping[str, Found]:
         """Return the layers that there are around a posture: the task's region, and the kind's."""
@@ -137,19 +136,18 @@ class Layers:
         ]
 
     def _margin(self, name: str, posture: Posture, found: Margin | None) -> list[Node]:
-        self.margin = margin = found
-        if margin is None:
+        if found is None:
             return []
-        name, ends = f"{ROBOT}/{name}", np.stack([posture.position, margin.point])
-        text = f"{1000 * margin.distance:.1f} mm to {margin.factor} = 0"
+        name, ends = f"{ROBOT}/{name}", np.stack([posture.position, found.point])
+        text = f"{1000 * found.distance:.1f} mm to {found.factor} = 0"
         return [
             self._scene.add_line_segments(
                 name, ends[None], (214, 48, 49), thickness=4.0, thickness_units="screen"
             ),
             self._scene.add_icosphere(
-                f"{name}_foot", 0.008, (214, 48, 49), position=margin.point, cast_shadow=False
+                f"{name}_foot", 0.008, (214, 48, 49), position=found.point, cast_shadow=False
             ),
-            self._scene.add_label(f"{name}_text", text, position=margin.point),
+            self._scene.add_label(f"{name}_text", text, position=found.point),
         ]
 
 
