@@ -15,7 +15,7 @@ from tpm_gym.viewer.kinds import Posture, find_kind
 from tpm_gym.viewer.layers import BEST, LAYERS, MAP, Layers
 from tpm_gym.viewer.play import Play
 from tpm_gym.viewer.player import Player
-from tpm_gym.viewer.scene import ROBOT, TASK_NODES, RobotScene, set_camera
+from tpm_gym.viewer.scene import RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
 
 
@@ -80,8 +80,6 @@ class Viewer:
     def _set_machine(self) -> None:
         kind = self.kind = self._kinds[self.machine.value]
         self.play.set_machine(kind.machine)
-        for name in (ROBOT, *TASK_NODES):
-            self.server.scene.remove_by_name(name)
         set_camera(self.server, kind.machine)
         self.robot = RobotScene(self.server.scene, kind.machine)
         self.layers = Layers(self.server.scene, kind)
