@@ -5,6 +5,7 @@ import os
 import pickle
 import re
 import shutil
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from episodes import expert_episode
 from paths import read_strict
-from processes import TPM_GYM, printed_by
+from processes import PYTHON, TPM_GYM, printed_by, signalled
 from registries import registries_put_back
 from trainings import quiet, said
 
@@ -324,6 +325,33 @@ def test_files_are_written_whole_or_not_at_all(tmp_path):
         provenance.write_whole(path, fail)
     assert read_strict(path) == {"value": 1}
     assert [entry.name for entry in tmp_path.iterdir()] == ["result.json"]
+
+
+def test_a_link_stays_and_its_target_is_written(tmp_path):
+    link, target = tmp_path / "link.json", tmp_path / "elsewhere" / "target"
+    link.symlink_to(target)
+    for value in (1, 2):  # the target is missing, then it is there
+        provenance.require_writable("--json", link)
+        provenance.write_json(link, {"value": value})
+        assert link.readlink() == target
+        assert read_strict(target) == {"value": value}
+
+
+HALF = """
+import sys, time
+from tpm_gym.learning import command_line, provenance
+def evaluate(config):
+    provenance.write_whole(config.json, lambda part: (part.write_text("half"), time.sleep(60)))
+command_line.evaluate = evaluate
+command_line.main(["evaluate", "--policy", "expert", "--json", sys.argv[1]])
+"""
+
+
+def test_a_command_that_is_terminated_leaves_no_part_of_a_file(tmp_path):
+    command = [PYTHON, "-c", HALF, tmp_path / "out.json"]
+    status, output = signalled(command, lambda: any(tmp_path.iterdir()), signal.SIGTERM)
+    assert (status, output) == (143, "")
+    assert not any(tmp_path.iterdir())
 
 
 def test_command_keeps_no_folder_outside(monkeypatch, tmp_path):

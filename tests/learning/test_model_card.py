@@ -49,7 +49,7 @@ def test_results_of_something_else_are_rejected(content, message, tmp_path):
     evaluation.write_text(content)
     with pytest.raises(SystemExit, match=message):
         export(tmp_path / "reach", evaluation)
-    assert not (tmp_path / "reach.md").exists()
+    assert list(tmp_path.iterdir()) == [evaluation]
 
 
 def test_a_card_replaces_no_file_of_others(tmp_path):
@@ -58,6 +58,7 @@ def test_a_card_replaces_no_file_of_others(tmp_path):
     with pytest.raises(SystemExit, match="no model card of tpm_gym"):
         export(tmp_path / "reach", RESULTS)
     assert card.read_text() == "my notes"
+    assert list(tmp_path.iterdir()) == [card]
     card.unlink()
     card.mkdir()
     with pytest.raises(SystemExit, match="no model card of tpm_gym"):

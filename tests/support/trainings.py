@@ -173,11 +173,11 @@ def state_of(content: Content) -> Any:
 
 
 def table(run: Path) -> list[dict[str, str]]:
-    """Return progress.csv without its clocks and without PPO's count of iterations a process."""
+    """Return progress.csv without its clocks."""
     with (run / "progress.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    unequal = ("time/fps", "time/time_elapsed", "time/iterations")
-    return [{k: v for k, v in row.items() if k not in unequal} for row in rows]
+    clocks = ("time/fps", "time/time_elapsed")
+    return [{k: v for k, v in row.items() if k not in clocks} for row in rows]
 
 
 def evaluations(run: Path) -> Any:

@@ -159,7 +159,8 @@ def test_layers_are_drawn_when_shown_and_gone_when_hidden(viewer):
     for name, box in viewer.shown.items():
         choose(viewer, box, name == "margin")
     assert drawn() == {"margin"}
-    assert viewer.layers.margin.distance == pytest.approx(0.24)
+    label = viewer.server.scene.get_handle_by_name("/robot/margin_text")
+    assert label.text.startswith("240.0 mm to ")
 
 
 def test_another_machine_is_shown_at_its_home(viewer):

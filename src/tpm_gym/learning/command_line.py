@@ -10,11 +10,11 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import Positional, subcommand
 
-from tpm_gym import TPMError
+from tpm_gym import TPMError, learning
 from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, unset
 from tpm_gym.learning.datasets import CollectConfig, collect
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
-from tpm_gym.learning.tune import TuneConfig
+from tpm_gym.learning.tune import TuneConfig, tune
 from tpm_gym.viewer import ViewConfig, run
 
 
@@ -54,35 +54,37 @@ def main(words: Sequence[str] | None = None) -> None:
     about = "Train and test policies for the robot of tpm_gym."
     options: Any = {"config": (tyro.conf.FlagCreatePairsOff,), "args": words}
     command: Any = tyro.cli(Command, prog="tpm-gym", description=about, **options)
+    # Without a handler, Python would end at once and leave temporary files.
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     stopped_by = None
     try:
-        if isinstance(command, EvaluationConfig):
-            evaluate(command)
-            return
-        if isinstance(command, ViewConfig):
-            run(command)
-            return
-        if isinstance(command, CollectConfig):
-            collect(command)
-            return
-        # Imported here, since they need PyTorch.
-        from tpm_gym.learning import export, model_card, training, tune
-
         match command:
             case TrainingConfig():
-                stopped_by = training.train(command)
+                stopped_by = learning.train(command)
             case ResumeConfig():
-                stopped_by = training.resume(command)
+                stopped_by = learning.resume(command)
+            case EvaluationConfig():
+                evaluate(command)
+            case CollectConfig():
+                collect(command)
             case TuneConfig():
-                print(tune.tune(command))
+                print(tune(command))
+            case ViewConfig():
+                run(command)
             case ExportConfig():
+                from tpm_gym.learning import export, model_card  # PyTorch is needed here only
+
                 print(f"exporting {command.model} and comparing its actions ...", flush=True)
+                evaluation = command.evaluation
                 policy = export.convert(
-                    command.model, command.out, trust_pickle=command.trust_pickle
+                    command.model,
+                    command.out,
+                    trust_pickle=command.trust_pickle,
+                    evaluation=evaluation,
                 )
                 print(policy)
-                if command.evaluation is not None:
-                    print(model_card.write(policy, command.evaluation))
+                if evaluation is not None:
+                    print(model_card.write(policy, evaluation))
     except TPMError as error:
         sys.exit(f"error: {error}")
     except KeyboardInterrupt:

@@ -19,7 +19,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import nn
 
 from tpm_gym import TPMError, load_policy
-from tpm_gym.learning import provenance
+from tpm_gym.learning import model_card, provenance
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES, Actor
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.features import GoalGapExtractor
@@ -128,8 +128,13 @@ def _require_free(path: Path) -> None:
         )
 
 
-def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
+def convert(
+    archive: Path, path: Path, *, trust_pickle: bool, evaluation: Path | None = None
+) -> Path:
     """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`, or copy an exported policy.
+
+    Args:
+        evaluation: Results for a model card, which are checked before anything is written.
 
     Returns:
         The JSON file.
@@ -140,7 +145,8 @@ def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
     provenance.require_writable("OUT", path)
     name = str(archive)
     if archive.suffix == ".json":
-        load_policy(archive)  # raises for a damaged policy
+        env_id = load_policy(archive).description.env_id
+        _check_card(path, env_id, evaluation)
         for old, new in zip(files(archive), files(path), strict=True):
             provenance.write_whole(new, partial(shutil.copyfile, old))
         return files(path)[0]
@@ -154,9 +160,15 @@ def convert(archive: Path, path: Path, *, trust_pickle: bool) -> Path:
     if (config := next(filter(None, found), None)) is None:
         where = f"no {CONFIG_FILE} of a training beside it or above it"
         raise refused(name, f"{where}; keep the file in its run folder")
+    _check_card(path, config["env"], evaluation)
     about = {key: config[key] for key in ("seed", "recipe", "env_options")}
     model = load_model(archive, config["algo"])
     return save(model, path, env_id=config["env"], versions=config.get("versions"), **about)
+
+
+def _check_card(path: Path, env_id: str, evaluation: Path | None) -> None:
+    if evaluation is not None:
+        model_card.check(files(path)[0].with_suffix(".md"), env_id, evaluation)
 
 
 def load_model(archive: Path, algorithm: str) -> BaseAlgorithm:

@@ -1,6 +1,6 @@
 """Pictures of a policy at work: a video of episodes, a contact sheet of one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +31,14 @@ def write_video(path: Path, play: Play, fps: float) -> None:
 
 
 def write_contact_sheet(path: Path, play: Play) -> None:
-    """Write a PNG of six moments of an episode."""
+    """Write a PNG of six moments of an episode, evenly spaced up to the end of the motion."""
     import imageio.v3 as imageio
 
     frames: list[Frame] = []
     play(frames.append)
-    write_whole(path, lambda part: imageio.imwrite(part, contact_sheet(frames)))
-
-
-def contact_sheet(frames: Sequence[Frame]) -> Frame:
-    """Return evenly spaced frames, up to the end of the motion, as (2 * height, 3 * width, 3)."""
     # Two frames differ if more than the last millimetres of a motion lie between them.
     differ = [(frame != frames[-1]).any(axis=-1).mean() > 1e-2 for frame in frames]
     last = max(np.flatnonzero(differ), default=len(frames) - 2) + 1
     moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
-    return tile([frames[moment] for moment in moments], _COLUMNS)
+    sheet = tile([frames[moment] for moment in moments], _COLUMNS)
+    write_whole(path, lambda part: imageio.imwrite(part, sheet))

@@ -28,45 +28,55 @@ def write(policy: Path, evaluation: Path) -> Path:
         evaluation: JSON file of ``tpm-gym evaluate --json`` with one policy.
 
     Raises:
-        ConfigError: ``evaluation`` is no such file, or belongs to another id, or the card would
-            replace a file of others.
+        ConfigError: As :func:`check`.
     """
     content = provenance.read_json(policy)
-    tested = _read(evaluation)
-    if tested["env"] != content["env"]:
-        raise ConfigError(
-            f"--evaluation {evaluation}: is of {tested['env']}, the policy is of {content['env']}"
-        )
     card = policy.with_suffix(".md")
+    text = _text(card.stem, content, check(card, content["env"], evaluation))
+    provenance.write_whole(card, lambda part: part.write_text(text, encoding="utf-8"))
+    return card
+
+
+def check(card: Path, env_id: str, evaluation: Path) -> dict[str, Any]:
+    """Return what an evaluation tells of a policy, as entries of the card.
+
+    Raises:
+        ConfigError: ``evaluation`` is no such file, or belongs to another id than ``env_id``, or
+            the card would replace a file of others.
+    """
     if card.is_dir() or (
         card.exists() and _OURS not in card.read_text(encoding="utf-8", errors="replace")
     ):
         raise ConfigError(f"{card}: is no model card of tpm_gym, and would be replaced; move it")
     try:
-        text = _text(card.stem, content, tested)
-    except (TypeError, KeyError, ValueError, AttributeError) as error:  # values of other types
-        raise ConfigError(f"--evaluation {evaluation}: is no result of {_WAY}") from error
-    provenance.write_whole(card, lambda part: part.write_text(text, encoding="utf-8"))
-    return card
-
-
-def _read(evaluation: Path) -> dict[str, Any]:
-    try:
-        tested: Any = provenance.read_json(evaluation)
-        needed = {"env", "episodes", "seed", "command", "versions", *_ROWS}
-        if isinstance(tested, dict) and needed <= tested.keys():
-            return tested
+        tested = provenance.read_json(evaluation)
     except (OSError, ValueError) as error:
         raise ConfigError(f"--evaluation {evaluation}: {error}") from error
-    raise ConfigError(f"--evaluation {evaluation}: is no result of {_WAY}")
+    ends = ("mean", "low", "high")
+    try:
+        env = tested["env"]
+        found = {
+            "success": tested["success_at_end"]["mean"],
+            "episodes": f"{tested['episodes']:,}",
+            "first": tested["seed"],
+            "rows": "\n".join(
+                f"| {label} | " + "".join(f"{tested[key][end]:.4g} | " for end in ends).rstrip()
+                for key, label in _ROWS.items()
+            ),
+            "command": tested["command"],
+            "versions": ", ".join(f"{key} {value}" for key, value in tested["versions"].items()),
+        }
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
+        raise ConfigError(f"--evaluation {evaluation}: is no result of {_WAY}") from error
+    if env != env_id:
+        raise ConfigError(f"--evaluation {evaluation}: is of {env}, the policy is of {env_id}")
+    return found
 
 
 def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> str:
-    success = tested["success_at_end"]
-    task = {"type": "reinforcement-learning", "name": "reinforcement-learning"}
-    metric = {"type": "success_rate", "value": success["mean"], "name": "success at the end"}
+    metric = {"type": "success_rate", "value": tested["success"], "name": "success at the end"}
     result = {
-        "task": task,
+        "task": {"type": "reinforcement-learning", "name": "reinforcement-learning"},
         "dataset": {"name": content["env"], "type": content["env"]},
         "metrics": [metric],
     }
@@ -76,10 +86,6 @@ def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> s
         "tags": ["reinforcement-learning", "gymnasium", "parallel-robot", content["algorithm"]],
         "model-index": [{"name": name, "results": [result]}],
     }
-    rows = (
-        f"| {label} | " + " | ".join(f"{tested[key][end]:.4g}" for end in ("mean", "low", "high"))
-        for key, label in _ROWS.items()
-    )
     options = content.get("env_options", {})
     template = Path(__file__).with_suffix(".md").read_text(encoding="utf-8")
     return template.format(
@@ -91,9 +97,5 @@ def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> s
         hidden=" and ".join(str(width) for width in content["network"]["hidden"]),
         options="".join(f", {key}={json.dumps(value)}" for key, value in options.items()),
         name=name,
-        episodes=tested["episodes"],
-        first=tested["seed"],
-        rows=" |\n".join(rows) + " |",
-        command=tested["command"],
-        versions=", ".join(f"{key} {value}" for key, value in tested["versions"].items()),
+        **tested,
     )

@@ -28,16 +28,17 @@ _ACTIONS: Final = 1  # not 0, which NumPy's seeds pad with
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Policy that acts with the mean action of a trained algorithm."""
+    """Policy of a trained algorithm: its mean action, or its actions as in training."""
 
     model: BaseAlgorithm | ExportedPolicy
+    deterministic: bool = True
 
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
         """Do nothing: the policy has no memory."""
 
     def act(self, observation: Observation) -> Action:
-        """Return the deterministic actions for ``observation``."""
-        action, _ = self.model.predict(observation, deterministic=True)
+        """Return the actions for ``observation``."""
+        action, _ = self.model.predict(observation, deterministic=self.deterministic)
         return action
 
 

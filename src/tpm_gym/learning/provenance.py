@@ -93,16 +93,26 @@ def _portable(word: str) -> str:
 
 def require_writable(option: str, path: Path) -> None:
     """Make the folder of a file that will be written later, and check that it can be written."""
+    problem = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
-            problem = "is a folder" if path.is_dir() else None
-        if path.exists() and not (path.is_file() or path.is_dir()):  # renaming would replace it
+        if path.is_dir():
+            problem = "is a folder"
+        elif path.exists() and not path.is_file():  # renaming would replace it
             problem = "is a device or a pipe"
+        else:
+            folder = _target(path).parent
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
     except OSError as error:
         problem = f"cannot be written: {error.strerror}"
     if problem:
         raise ConfigError(f"{option} {path}: {problem}; choose another name")
+
+
+def _target(path: Path) -> Path:
+    """Follow links; unlike ``Path.resolve``, accept links in a circle."""
+    return Path(os.path.realpath(path))
 
 
 def read_json(path: Path) -> Any:
@@ -122,12 +132,14 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file under a temporary name and rename it, so that readers never see a part of it.
 
-    Missing parent folders are made. ``write`` gets a path in the same folder, with the same suffix.
+    Missing parent folders are made. A link stays, and its target is replaced. ``write`` gets a path
+    with the same suffix.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{uuid.uuid4().hex}{path.suffix}")
+    target = _target(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    part = target.with_name(f".{uuid.uuid4().hex}{path.suffix}")
     try:
         write(part)
-        part.replace(path)
+        part.replace(target)
     finally:
         part.unlink(missing_ok=True)

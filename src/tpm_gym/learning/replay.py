@@ -20,21 +20,12 @@ from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.recipes import read_recipes, recipe_file
-from tpm_gym.learning.rollout import Action, Observation, Policy
+from tpm_gym.learning.rollout import Policy
 from tpm_gym.learning.training import make_model, training_envs_of
 
 MOMENTS: Final = 10
 
 Record = Callable[[TPMVectorEnv, Policy, int, int], Iterator[Any]]
-
-
-class _Exploring(TrainedPolicy):
-    """Policy that samples its actions as in training."""
-
-    def act(self, observation: Observation) -> Action:
-        """Return sampled actions for ``observation``."""
-        action, _ = self.model.predict(observation, deterministic=False)
-        return action
 
 
 @dataclass(eq=False)
@@ -95,7 +86,8 @@ def episodes(
             first, end = parts[moment : moment + 2]
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(seed + first)
-                found.extend(record(envs, _Exploring(model), end - first, seed + first))
+                policy = TrainedPolicy(model, deterministic=False)
+                found.extend(record(envs, policy, end - first, seed + first))
 
         model = make_model(config, training_envs)
         called: list[BaseCallback] = [_Moments(config.steps, use)]

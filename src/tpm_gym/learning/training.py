@@ -234,7 +234,8 @@ class _Session:
         start = f"from step {content.step if content else 0:,} to "
         start = start if "resumed" in self.description else ""
         _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
-        model.set_logger(training_state.make_logger(config.run, content))
+        iterations = max(0, model.num_timesteps - config.demonstrated) // config.rollout
+        model.set_logger(training_state.make_logger(config.run, content, iterations))
         return seconds, evaluations
 
     def _learn(

@@ -276,8 +276,19 @@ def _pending(content: Content) -> dict[str, NDArray[Any]]:
     return starting(content.arrays, "log/")
 
 
-def make_logger(run: Path, content: Content | None = None) -> Logger:
-    """Open the log of a run, as it was at a checkpoint."""
+class _Log(Logger):
+    """Log in which iterations count from the beginning of the run, not of the process."""
+
+    earlier = 0
+
+    def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
+        """Store a value for the next line."""
+        counted = key == "time/iterations"
+        super().record(key, value + self.earlier if counted else value, exclude)
+
+
+def make_logger(run: Path, content: Content | None, iterations: int) -> Logger:
+    """Open the log of a run, as it was at a checkpoint after so many iterations."""
     path = run / PROGRESS_FILE
     before = "" if content is None or not path.is_file() else path.read_text(encoding="utf-8")
     table = CSVOutputFormat(str(path))  # empties the file
@@ -285,7 +296,8 @@ def make_logger(run: Path, content: Content | None = None) -> Logger:
     table.file.flush()
     table.keys = before.split("\n", 1)[0].split(",") if before else []
     events = TensorBoardOutputFormat(str(run))
-    logger = Logger(str(run), [table, events])
+    logger = _Log(str(run), [table, events])
+    logger.earlier = iterations
     if content is not None:
         # TensorBoard then hides events that an earlier process logged after this step.
         start = Event(step=content.step + 1, session_log=SessionLog(status=SessionLog.START))

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tpm_gym.errors import MissingPackageError
-
 if TYPE_CHECKING:
     from tpm_gym.mechanism import Machine
     from tpm_gym.viewer.viewer import Viewer
@@ -50,10 +48,8 @@ def open_viewer(
         MissingPackageError: If viser is not installed.
         ConfigurationError: If no machine has this name, or an option is not possible.
     """
-    try:
-        from tpm_gym.viewer.viewer import Viewer
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(error.name or "viser", "view") from error
+    from tpm_gym.viewer.viewer import Viewer
+
     return Viewer(machine, host, port)
 
 
@@ -65,10 +61,8 @@ def run(config: ViewConfig) -> None:
         ConfigurationError: If no machine has this name, or an option is not possible.
     """
     if config.export is not None:
-        try:
-            from tpm_gym.viewer.export import export
-        except ModuleNotFoundError as error:
-            raise MissingPackageError(error.name or "viser", "view") from error
+        from tpm_gym.viewer.export import export
+
         print(export(config.export, config.machine))
         return
     viewer = open_viewer(config.machine, host=config.host, port=config.port)

@@ -15,8 +15,6 @@ from tpm_gym.viewer.kinds import Kind, Posture
 from tpm_gym.viewer.scene import ROBOT
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Explore", "units"]
-
 _Label = TypeVar("_Label")
 
 
@@ -53,26 +51,17 @@ class Explore:
         self.working_lists: list[Any] = [gui.add_dropdown("Working", ("",)) for _ in range(2)]
         self.assembly: Any = gui.add_dropdown("Assembly", ("",))
         for handle in (self.operation, *self.working_lists):
-            self._on(handle, "modes", self._point_again)
-        self._on(self.assembly, "modes", self._joints_again)
+            handle.on_update(lambda _: self._worker.ask("modes", self._point_again))
+        self.assembly.on_update(lambda _: self._worker.ask("modes", self._joints_again))
 
     def _add_motors(self, gui: GuiApi) -> None:
         self.motors: list[Any] = [
             gui.add_slider(f"Motor {k + 1}", -180.0, 180.0, 0.1, 0.0) for k in range(3)
         ]
         for motor in self.motors:
-            self._on(motor, "motors", self._joints_again)
+            motor.on_update(lambda _: self._worker.ask("motors", self._joints_again))
         home = gui.add_button("Back to the machine's home")
         home.on_click(lambda _: self._worker.put("home", self.go_home))
-
-    def _on(self, handle: Any, name: str, job: Callable[[], object]) -> None:
-        """Run a job when a user changes a value; values that a job itself sets do not count."""
-
-        def changed(event: object) -> None:
-            if not self._worker.here:
-                self._worker.put(name, job)
-
-        handle.on_update(changed)
 
     # -- machine ------------------------------------------------------------------------------
 

@@ -13,8 +13,6 @@ from tpm_gym.viewer.kinds import find_kind
 from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.scene import RobotScene, set_camera
 
-__all__ = ["export"]
-
 _ENV: Final = "TPMPickAndPlace-v0"
 _HOLD: Final = 0.8
 """Time for which the first and the last posture stay, s."""

@@ -19,8 +19,6 @@ from tpm_gym.viewer.kinds.kind import Found, Kind, Margin, Posture
 from tpm_gym.viewer.meshes import Mesh, cells_mesh
 from tpm_gym.viewer.scene import ROBOT
 
-__all__ = ["BEST", "LAYERS", "Layers", "colours"]
-
 Node = Any
 """Node of a viser scene."""
 
@@ -33,18 +31,18 @@ _ASPECTS: Final = (
     (46, 160, 67), (219, 132, 0), (17, 138, 178), (191, 64, 160), (140, 150, 30), (99, 110, 250),
     (200, 80, 60), (0, 150, 136),
 )  # fmt: skip
-_MAP: Final = np.array(
+MAP: Final = np.array(
     [(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)], dtype=float
 )
+"""Colours of the conditioning, evenly spaced from 0 to :data:`BEST`."""
 BEST: Final = 0.4
 """Conditioning at the end of the colour map."""
 
 
 def colours(values: FloatArray) -> NDArray[np.uint8]:
     """Return colours (..., 3) of conditionings (...,)."""
-    place = np.clip(values / BEST, 0.0, 1.0) * (len(_MAP) - 1)
-    parts = [np.interp(place, range(len(_MAP)), _MAP[:, k]) for k in range(3)]
-    return np.stack(parts, axis=-1).astype(np.uint8)
+    stops = np.linspace(0.0, BEST, len(MAP))
+    return np.stack([np.interp(values, stops, part) for part in MAP.T], axis=-1).astype(np.uint8)
 
 
 class Layers:
@@ -60,7 +58,6 @@ class Layers:
         self._scene, self._kind = scene, kind
         self._nodes: dict[str, list[Node]] = {}
         self._keys: dict[str, Any] = {}
-        self.margin: Margin | None = None
 
     def around(self, posture: Posture) -> Mapping[str, Found]:
         """Return the layers that there are around a posture: the task's region, and the kind's."""
@@ -139,19 +136,18 @@ class Layers:
         ]
 
     def _margin(self, name: str, posture: Posture, found: Margin | None) -> list[Node]:
-        self.margin = margin = found
-        if margin is None:
+        if found is None:
             return []
-        name, ends = f"{ROBOT}/{name}", np.stack([posture.position, margin.point])
-        text = f"{1000 * margin.distance:.1f} mm to {margin.factor} = 0"
+        name, ends = f"{ROBOT}/{name}", np.stack([posture.position, found.point])
+        text = f"{1000 * found.distance:.1f} mm to {found.factor} = 0"
         return [
             self._scene.add_line_segments(
                 name, ends[None], (214, 48, 49), thickness=4.0, thickness_units="screen"
             ),
             self._scene.add_icosphere(
-                f"{name}_foot", 0.008, (214, 48, 49), position=margin.point, cast_shadow=False
+                f"{name}_foot", 0.008, (214, 48, 49), position=found.point, cast_shadow=False
             ),
-            self._scene.add_label(f"{name}_text", text, position=margin.point),
+            self._scene.add_label(f"{name}_text", text, position=found.point),
         ]
 
 

@@ -16,8 +16,6 @@ from tpm_gym.kinematics import WorkingMode
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import reachable
 
-__all__ = ["SURFACES", "Mesh", "cells_mesh", "clipped", "grid_mesh", "slice_mesh", "surface"]
-
 _AROUND = 33  # points along the half circle of link 7
 _SLACK = 1e-9  # share of l4 by which a leg may miss a boundary on which it lies
 _SMOOTHING = 4  # rounds
@@ -40,7 +38,13 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
         mode: The working mode.
         geometry: Link lengths.
     """
-    points = _POINTS.get(factor, _swept)(factor, mode, geometry)
+    flat = factor in ("sin_beta", "cos_beta")
+    if flat:
+        points = _planes(factor, geometry)
+    elif factor == "leg3":
+        points = _torus(geometry)
+    else:
+        points = _swept(factor, mode, geometry)
     # A leg that is stretched reaches with a longer rod; one that is folded, with a shorter rod.
     longer, shorter = (replace(geometry, l4=geometry.l4 * (1 + sign * _SLACK)) for sign in (1, -1))
 
@@ -48,7 +52,7 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
         found: BoolArray = reachable(points, mode, longer) | reachable(points, mode, shorter)
         return found
 
-    if factor in ("sin_beta", "cos_beta"):
+    if flat:
         return grid_mesh(clipped(points, there))
     return grid_mesh(np.where(there(points)[..., None], points, np.nan))
 
@@ -83,9 +87,8 @@ def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
     return np.where(ours[..., None], np.stack(points, axis=-1), np.nan)
 
 
-def _planes(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
+def _planes(factor: str, g: Geometry) -> FloatArray:
     """Return points (m, a, b, 3) of the plane y = 0 of sin(beta), or |y| = l7 of cos(beta)."""
-    del mode
     reach = g.l3 + g.l4
     x = np.linspace(-g.l1 - reach - g.l7, g.l1 + reach + g.l7, 241)
     z = np.linspace(-reach, reach + 2 * g.l6, 181)
@@ -94,9 +97,8 @@ def _planes(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
     return np.stack([points[1], points[0], points[2]], axis=-1)
 
 
-def _torus(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
+def _torus(g: Geometry) -> FloatArray:
     """Return points (2, a, b, 3) on which leg 3 is stretched or folded: parts of a torus."""
-    del factor, mode
     turn = np.linspace(0, 2 * np.pi, 257)[:, None]
     tilt = np.arcsin(min(1.0, g.l7 / g.l4)) * np.linspace(-1, 1, _AROUND)
     parts = []
@@ -107,11 +109,6 @@ def _torus(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
     return np.stack(parts)
 
 
-_POINTS: Final[dict[str, Callable[[str, WorkingMode, Geometry], FloatArray]]] = {
-    "sin_beta": _planes,
-    "cos_beta": _planes,
-    "leg3": _torus,
-}
 SURFACES: Final = {
     "parallel": ("sin_beta", "level3", "planar"),
     "serial": ("cos_beta", "leg1", "leg2", "leg3"),

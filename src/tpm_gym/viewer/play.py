@@ -16,8 +16,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.worker import Worker
 
-__all__ = ["Play"]
-
 _COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118ab2")
 _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1
@@ -63,24 +61,20 @@ class Play:
         self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "Next"))
         self._status: Any = gui.add_html("")
         self._gui = gui
-        self._plots: list[dict[Any, GuiUplotHandle | None]] = [{}, {}]
+        self._plots: list[dict[Any, GuiUplotHandle]] = [{}, {}]
         self._folders = [gui.add_folder(None) for _ in self._plots]
         self._connect()
 
     def _connect(self) -> None:
         for handle in (self.engine, self.policy, self.file):
-            handle.on_update(lambda _: self._put("player", self.discard))
-        self.env_id.on_update(lambda _: self._put("player", self._set_env))
-        self.speed.on_update(lambda _: self._put("speed", self._set_speed))
-        self.seed.on_update(lambda _: self._put("seed", self.discard_episode))
+            handle.on_update(lambda _: self._worker.ask("player", self.discard))
+        self.env_id.on_update(lambda _: self._worker.ask("player", self._set_env))
+        self.speed.on_update(lambda _: self._worker.ask("speed", self._set_speed))
+        self.seed.on_update(lambda _: self._worker.ask("seed", self.discard_episode))
         jobs = {
             "Play": self.play, "Pause": self.pause, "Step": self.step, "Next": self.new
         }  # fmt: skip
-        self.buttons.on_click(lambda event: self._put("button", jobs[event.target.value]))
-
-    def _put(self, name: str, job: Callable[[], object]) -> None:
-        if not self._worker.here:
-            self._worker.put(name, job)
+        self.buttons.on_click(lambda event: self._worker.ask("button", jobs[event.target.value]))
 
     # -- what the controls do -----------------------------------------------------------------
 
@@ -200,19 +194,19 @@ class Play:
     ) -> None:
         """Draw curves. Keep one plot for each set of names, because pages may still update it."""
         key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
-        shown = self._plots[place].setdefault(key, None)
-        for other, plot in self._plots[place].items():
-            if plot is not None and plot.visible != (other == key):
+        plots = self._plots[place]
+        for other, plot in plots.items():
+            if plot.visible != (other == key):
                 plot.visible = other == key
-        if shown is not None:
-            shown.data = data
+        if key in plots:
+            plots[key].data = data
             return
         series = [
             uplot.Series(label=name, stroke=paint, width=2)
             for name, paint in zip(names, _COLOURS, strict=False)
         ]
         with self._folders[place]:
-            self._plots[place][key] = self._gui.add_uplot(
+            plots[key] = self._gui.add_uplot(
                 data,
                 (uplot.Series(label="step"), *series),
                 title=title,
@@ -224,8 +218,7 @@ class Play:
     @property
     def plots(self) -> list[GuiUplotHandle]:
         """Plots of the reward terms and the torques that are shown."""
-        made = [plot for place in self._plots for plot in place.values() if plot is not None]
-        return [plot for plot in made if plot.visible]
+        return [plot for plots in self._plots for plot in plots.values() if plot.visible]
 
     @property
     def status(self) -> str:

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 import tpm_gym
 from tpm_gym.envs.ids import env_ids
+from tpm_gym.envs.single import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.policy.files import published
 from tpm_gym.simulation.engine import engine_names
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks.expert import Expert
-from tpm_gym.tasks.task import Task
-
-__all__ = ["SCRIPTED", "Player", "installed_engines", "policies_for"]
 
 SCRIPTED: Final = ("expert", "random")
 _PACKAGES: Final = {"pybullet": "pybullet", "mujoco": "mujoco"}
@@ -81,6 +79,7 @@ class Player:
             one.
 
     Attributes:
+        task: The environment's task.
         records: One for each step of the episode so far.
         ended: Whether the episode has ended, or none has begun.
 
@@ -95,8 +94,11 @@ class Player:
         """Make the environment and load the policy."""
         _require_id(env_id)
         self._env = gym.make(env_id, engine=engine, machine=machine, disable_env_checker=True)
+        assert isinstance(self._env.unwrapped, TPMEnv)
+        self._inner = self._env.unwrapped
+        self.task = self._inner.task
         try:
-            self._act, self._prepare = self._load(policy)
+            self._act = self._load(policy)
         except BaseException:
             self._env.close()
             raise
@@ -105,16 +107,15 @@ class Player:
         self._observation: Any = None
         self._rng = np.random.default_rng()
 
-    def _load(self, policy: str) -> tuple[Callable[[Any], Any], Callable[[Any, int], None]]:
-        """Return two functions of a policy: one acts, one prepares an episode from its seed."""
+    def _load(self, policy: str) -> Callable[[Any], Any]:
+        """Return a function that acts on an observation."""
         if policy == "random":
-            return self._draw, lambda observation, seed: None
+            return self._draw
         if policy == "expert":
-            expert = Expert(self._env)
-            return expert.act, lambda observation, seed: expert.reset(observation)
+            return Expert(self._env).act
         loaded = tpm_gym.load_policy(policy)
         loaded.check(self._env)
-        return loaded.act, lambda observation, seed: None
+        return loaded.act
 
     def _draw(self, observation: Any) -> Any:
         """Return a uniform action; the draws of an episode depend on its seed alone."""
@@ -123,22 +124,14 @@ class Player:
         return self._rng.uniform(space.low, space.high).astype(space.dtype)
 
     @property
-    def task(self) -> Task:
-        """The environment's task."""
-        task: Task = self._inner.task
-        return task
-
-    @property
     def state(self) -> State:
         """State of the robot, without a leading axis."""
-        state: State = self._inner.state
-        return state
+        return self._inner.state
 
     @property
     def markers(self) -> NDArray[np.float64]:
         """Points (k, 3) m, world, that show the goal."""
-        markers: NDArray[np.float64] = self.task.markers(self._inner.goal)
-        return markers
+        return self.task.markers(self._inner.goal)
 
     @property
     def length(self) -> int:
@@ -146,15 +139,10 @@ class Player:
         spec = self._env.spec
         return spec.max_episode_steps if spec and spec.max_episode_steps else 0
 
-    @property
-    def _inner(self) -> Any:
-        return self._env.unwrapped
-
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self._observation, _ = self._env.reset(seed=seed)
         self._rng = np.random.default_rng(seed)
-        self._prepare(self._observation, seed)
         self.records, self.ended = [], False
 
     def step(self) -> Record:

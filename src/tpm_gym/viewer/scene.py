@@ -19,14 +19,11 @@ from tpm_gym.mechanism.urdf import COLOURS
 from tpm_gym.simulation.stage import BELT, FLOOR, PATCH_HEIGHT, TABLE, painted
 from tpm_gym.simulation.state import Patch, Scene, State
 
-__all__ = ["ROBOT", "TASK_NODES", "RobotScene", "colour", "set_camera"]
-
 ROBOT: Final = "/robot"
 """Node whose frame is the machine's frame; everything in that frame hangs below it."""
 
-TASK_NODES: Final = "/objects", "/goals", "/paint"
+_TASK: Final = "/objects", "/goals", "/paint"
 """Nodes below which objects, goal markers, belt and paint of a task hang; world frame."""
-
 _GOAL: Final = (30, 160, 70)
 
 
@@ -60,8 +57,10 @@ class RobotScene:
     """
 
     def __init__(self, scene: SceneApi, machine: Machine) -> None:
-        """Add all links and the table to the scene."""
+        """Replace the robot, its table and the task of the scene."""
         self._scene, self._machine = scene, machine
+        for name in (ROBOT, *_TASK):
+            scene.remove_by_name(name)
         turn = _first(machine.mount.quaternion)
         origin = machine.mount.to_world(np.zeros(3))
         scene.add_frame(ROBOT, show_axes=False, wxyz=turn, position=origin)
@@ -74,7 +73,6 @@ class RobotScene:
         self._poses = np.full((len(self.links), 7), np.nan)  # m; quaternion (w, x, y, z)
         self._add_table()
         self._objects: list[Any] = []
-        self._paint: list[Any] = []
         self._markers: list[Any] = []
 
     def _add_table(self) -> None:
@@ -105,14 +103,15 @@ class RobotScene:
 
     def set_objects(self, scene: Scene, tolerance: float) -> None:
         """Replace objects, goal markers, belt and paint by the task's."""
-        for node in (*self._objects, *self._markers, *self._paint):
-            node.remove()
+        for name in _TASK:
+            self._scene.remove_by_name(name)
         patches = painted(scene)
         if scene.belt is not None:
             half = self._machine.table[1]
             ends = (scene.belt.start, -half), (scene.belt.end, half)
             patches.insert(0, Patch(*ends, BELT.colour))
-        self._paint = [self._add_patch(index, patch) for index, patch in enumerate(patches)]
+        for index, patch in enumerate(patches):
+            self._add_patch(index, patch)
         self._objects = [
             self._scene.add_box(
                 f"/objects/{block.name}", colour(block.colour), 2 * np.array(block.half)
@@ -126,11 +125,11 @@ class RobotScene:
             for index in range(scene.markers)
         ]
 
-    def _add_patch(self, index: int, patch: Patch) -> Any:
+    def _add_patch(self, index: int, patch: Patch) -> None:
         """Add a painted rectangle; a later one lies above the earlier ones."""
         low, high = np.array(patch.low), np.array(patch.high)
         size, place = (*(high - low), PATCH_HEIGHT), (*(low + high) / 2, min(index, 1) * 1e-4)
-        return self._scene.add_box(
+        self._scene.add_box(
             f"/paint/{index}", colour(patch.colour), size, position=place, cast_shadow=False
         )
 

@@ -7,12 +7,13 @@ import io
 import socket
 from contextlib import redirect_stdout
 
-from viser import ViserServer
-
 from tpm_gym.arrays import is_whole
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.errors import ConfigurationError, MissingPackageError
 
-__all__ = ["start", "stop"]
+try:
+    from viser import ViserServer
+except ModuleNotFoundError as error:
+    raise MissingPackageError(error.name or "viser", "view") from error
 
 _TRIES = 100
 _TAKEN = errno.EADDRINUSE, errno.EACCES

@@ -12,33 +12,25 @@ from tpm_gym.mechanism.machine import Machine, machine_names
 from tpm_gym.viewer import server
 from tpm_gym.viewer.explore import Explore, units
 from tpm_gym.viewer.kinds import Posture, find_kind
-from tpm_gym.viewer.layers import BEST, LAYERS, Layers
+from tpm_gym.viewer.layers import BEST, LAYERS, MAP, Layers
 from tpm_gym.viewer.play import Play
 from tpm_gym.viewer.player import Player
-from tpm_gym.viewer.scene import ROBOT, TASK_NODES, RobotScene, set_camera
+from tpm_gym.viewer.scene import RobotScene, set_camera
 from tpm_gym.viewer.worker import Worker
-
-__all__ = ["Viewer"]
 
 
 class Viewer:
     """Page with a robot that can be dragged, and that plays episodes.
 
-    Args:
-        machine: Name of a machine, or a machine.
-        host: Address to listen on.
-        port: Port to listen on; if it is taken, the next free one.
+    :func:`tpm_gym.viewer.open_viewer` explains the arguments.
 
     Attributes:
         explore: Controls of the posture.
         play: Controls of episodes.
         worker: Thread that runs all changes.
-
-    Raises:
-        ConfigurationError: If no machine has this name, or the address is not possible.
     """
 
-    def __init__(self, machine: str | Machine = "paper", host: str = "127.0.0.1", port: int = 8080):
+    def __init__(self, machine: str | Machine, host: str, port: int) -> None:
         """Start the server, and show the machine at its home."""
         first = find_kind(machine)
         self.server = server.start(host, port)
@@ -88,8 +80,6 @@ class Viewer:
     def _set_machine(self) -> None:
         kind = self.kind = self._kinds[self.machine.value]
         self.play.set_machine(kind.machine)
-        for name in (ROBOT, *TASK_NODES):
-            self.server.scene.remove_by_name(name)
         set_camera(self.server, kind.machine)
         self.robot = RobotScene(self.server.scene, kind.machine)
         self.layers = Layers(self.server.scene, kind)
@@ -152,9 +142,9 @@ def numbers(posture: Posture) -> str:
 
 def _scale() -> str:
     """Return the colour map of the conditioning as HTML."""
+    parts = ",".join(f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in MAP)
     return (
-        '<div style="padding:0 1em;font-size:0.8em"><div style="height:0.7em;background:linear-'
-        "gradient(to right,rgb(68,1,84),rgb(59,82,139),rgb(33,145,140),rgb(94,201,98),"
-        'rgb(253,231,37))"></div><span>0</span><span style="float:right">'
-        f"conditioning {BEST}</span></div>"
+        '<div style="padding:0 1em;font-size:0.8em">'
+        f'<div style="height:0.7em;background:linear-gradient(to right,{parts})"></div>'
+        f'<span>0</span><span style="float:right">conditioning {BEST}</span></div>'
     )

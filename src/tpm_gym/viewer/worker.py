@@ -6,8 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 
-__all__ = ["Worker"]
-
 Job = Callable[[], object]
 
 
@@ -31,16 +29,16 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="tpm-gym viewer", daemon=True)
         self._thread.start()
 
-    @property
-    def here(self) -> bool:
-        """Whether the caller is a job of this worker."""
-        return threading.current_thread() is self._thread
-
     def put(self, name: str, job: Job) -> None:
         """Run a job as soon as the jobs before it are done."""
         with self._change:
             self._jobs[name] = job
             self._change.notify_all()
+
+    def ask(self, name: str, job: Job) -> None:
+        """Run a job that a user asks for; do nothing if a job has set the control's value."""
+        if threading.current_thread() is not self._thread:
+            self.put(name, job)
 
     def tick(self, period: float, job: Job) -> None:
         """Run a job every ``period`` seconds, or as often as the jobs leave time."""
@@ -63,7 +61,7 @@ class Worker:
         with self._change:
             self._closed = True
             self._change.notify_all()
-        if not self.here:
+        if threading.current_thread() is not self._thread:
             self._thread.join(timeout=5.0)
 
     def _run(self) -> None:

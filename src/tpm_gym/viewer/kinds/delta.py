@@ -18,8 +18,6 @@ from tpm_gym.mechanism.delta.geometry import ASSEMBLY_MODES, ELBOWS_OUT, WORKING
 from tpm_gym.viewer.kinds.kind import Found, Kind, Posture, elbows
 from tpm_gym.viewer.meshes import slice_mesh
 
-__all__ = ["DeltaKind"]
-
 _SHAPE: Final = (96, 96, 96)
 
 

@@ -16,8 +16,6 @@ from tpm_gym.mechanism.bodies import Place
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import State
 
-__all__ = ["Found", "Kind", "Margin", "Posture", "elbows"]
-
 Found: TypeAlias = tuple[Any, Callable[[], Any]]
 """Layer of a posture: the values that it depends on, and a function that computes what to draw."""
 

@@ -21,8 +21,6 @@ from tpm_gym.simulation.state import State
 from tpm_gym.viewer.kinds.kind import Found, Kind, Margin, Posture, elbows
 from tpm_gym.viewer.meshes import SURFACES, slice_mesh, surface
 
-__all__ = ["TPMKind"]
-
 _LINK_7: Final = {"towards +x": 1, "towards -x": -1}
 _FINE: Final = (96, 24, 128)
 
