@@ -174,9 +174,15 @@ def factors_at(
 def _regular(
     results: _Results, theta: ArrayLike, branch: AssemblyMode, g: Geometry
 ) -> list[FloatArray]:
-    """Compute results where J exists; raise SingularityError where it does not."""
+    """Compute results; raise SingularityError for the smallest factor if J does not exist."""
     singular, *found = _from_angles(lambda c: [c.factors[:3], *results(c)], theta, branch, g)
-    require_regular(singular, g)
+    names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
+    scaled = [singular[..., i].reshape(-1) / (1.0, g.l4, g.l4**2)[i] for i in range(3)]
+    if len(scaled[0]):
+        least = [some[abs(some).argmin()].item() for some in scaled]
+        smallest, name = min(zip(least, names, strict=True), key=lambda pair: abs(pair[0]))
+        if abs(smallest) < equations.SINGULAR:
+            raise SingularityError(name, smallest)
     return found
 
 
@@ -232,15 +238,3 @@ def _conditioning(c: _Configuration) -> Numbers:
     """Compute the conditioning, and 0 where J does not exist."""
     found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
     return c.ns.where(found <= 1.0, found, 0.0)
-
-
-def require_regular(values: FloatArray, geometry: Geometry) -> None:
-    """Raise SingularityError for the smallest factor of det A (..., 3) if it counts as zero."""
-    l4 = geometry.l4
-    names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
-    scaled = [values[..., i].reshape(-1) / (1.0, l4, l4**2)[i] for i in range(3)]
-    if len(scaled[0]):
-        least = [some[abs(some).argmin()].item() for some in scaled]
-        smallest, name = min(zip(least, names, strict=True), key=lambda pair: abs(pair[0]))
-        if abs(smallest) < equations.SINGULAR:
-            raise SingularityError(name, smallest)

@@ -28,10 +28,9 @@ from typing import ClassVar, NamedTuple
 
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations, jacobian
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
-from tpm_gym.kinematics.jacobian import factors, require_regular
 from tpm_gym.kinematics.namespaces import Namespace, Numbers
 from tpm_gym.mechanism.equation_of_motion import Energy as Energy
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
@@ -276,8 +275,7 @@ class Dynamics(EquationOfMotion):
 
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
         try:
-            found = factors(theta, self.branch, self.geometry)
-            require_regular(found.parallel, self.geometry)
+            jacobian.velocity(theta, self.branch, self.geometry)
         except (UnreachableError, SingularityError) as error:
             return error
         raise AssertionError(theta)
