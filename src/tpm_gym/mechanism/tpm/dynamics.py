@@ -64,13 +64,8 @@ class Pose(NamedTuple):
 
 
 class Velocities(NamedTuple):
-    """Velocities, m/s: C1 along x and z, P, l7 times the rate of beta, and changes of B_iC_i.
+    """Velocities, m/s: l7 times the rate of beta, and changes of B_iC_i, of B2C2 along x and z."""
 
-    The change of B2C2 is given along x and z.
-    """
-
-    link3: tuple[Numbers, Numbers]
-    platform: Triple
     turn: Numbers
     rod1: Triple
     rod2: tuple[Numbers, Numbers]
@@ -104,20 +99,15 @@ def pose_at(
 
 
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
-    """Compute the torques for rates (rad/s), their changes (rad/s^2) and gravity (m/s^2)."""
-    v = velocities(pose, rates)
-    return carried(pose, v, changes, accelerations(pose, rates, changes, v), gravity, m)
-
-
-def carried(
-    pose: Pose, v: Velocities, changes: Triple, a: Accelerations, gravity: Triple, m: Inertia
-) -> Triple:
-    """Compute the motors' torques for velocities and accelerations of the points.
+    """Compute the torques for rates (rad/s), their changes (rad/s^2) and gravity (m/s^2).
 
     Weight equals the inertial force of an additional acceleration by -gravity.
     """
+    v = velocities(pose, rates)
     (c1, c2, c3), (s1, s2, s3), (r1, _, r3) = pose.cos, pose.sin, pose.rods
-    (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = a
+    (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = accelerations(
+        pose, rates, changes, v
+    )
     f1x, f1y, f1z = swing_force(r1, v.rod1, (-b1y, cz - b1z), m.swing1)
     f3y, f3x, f3z = swing_force(
         (r3[1], r3[0], r3[2]), (v.rod3[1], v.rod3[0], v.rod3[2]), (px - b3x, pz - b3z), m.swing3
@@ -201,8 +191,6 @@ def velocities(pose: Pose, rates: Triple) -> Velocities:
     x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
     px, py = x - f.sin_beta * turn, f.cos_beta * turn
     return Velocities(
-        (x, z),
-        (px, py, z),
         turn,
         (x, s1 * u1, z - c1 * u1),
         (x + s2 * u2, z - c2 * u2),
