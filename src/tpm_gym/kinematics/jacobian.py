@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, points
+from tpm_gym.arrays import FloatArray, finite_points, first_row, points
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Factors as Factors
@@ -199,8 +199,7 @@ def _from_angles(
     angles = finite_points("theta", theta)
     missing, *found = by_rows(text, angles)
     if missing.any():
-        a, b, c = angles[missing != 0][0].tolist()
-        raise equations.no_assembly((a, b, c), branch, g)
+        raise equations.no_assembly(first_row(angles, missing != 0), branch, g)
     return found
 
 
