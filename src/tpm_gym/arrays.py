@@ -117,6 +117,12 @@ def finite_points(name: str, value: ArrayLike) -> FloatArray:
     return array
 
 
+def first_row(points: FloatArray, chosen: BoolArray) -> Vector:
+    """Return the first of points (..., 3) that is chosen (...,), as plain floats."""
+    x, y, z = points[chosen][0].tolist()
+    return x, y, z
+
+
 def is_tensor(value: object) -> bool:
     """Return whether a value is a tensor; torch is not imported for it."""
     return isinstance(value, getattr(sys.modules.get("torch"), "Tensor", ()))

@@ -299,9 +299,8 @@ def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
     for j in range(1, len(order)):
         added = chains[: j + 1] if j == 1 else chains[j : j + 1]
         names = tuple(chain.name for chain in added)
-        freedoms, actuated = (
-            sum(getattr(c, key) for c in added) for key in ("freedoms", "actuated")
-        )
+        freedoms = sum(chain.freedoms for chain in added)
+        actuated = sum(chain.actuated for chain in added)
         # Eq. (3b): xi_Lj = dim{(intersection of the j previous chains) union chain j + 1}
         equations = (parallel(sets[:j]) | sets[j]).dim
         loops.append(Loop(names, freedoms, actuated, equations))

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, points
+from tpm_gym.arrays import FloatArray, finite_points, first_row, points
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Factors as Factors
@@ -174,9 +174,15 @@ def factors_at(
 def _regular(
     results: _Results, theta: ArrayLike, branch: AssemblyMode, g: Geometry
 ) -> list[FloatArray]:
-    """Compute results where J exists; raise SingularityError where it does not."""
+    """Compute results; raise SingularityError for the smallest factor if J does not exist."""
     singular, *found = _from_angles(lambda c: [c.factors[:3], *results(c)], theta, branch, g)
-    require_regular(singular, g)
+    names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
+    scaled = [singular[..., i].reshape(-1) / (1.0, g.l4, g.l4**2)[i] for i in range(3)]
+    if len(scaled[0]):
+        least = [some[abs(some).argmin()].item() for some in scaled]
+        smallest, name = min(zip(least, names, strict=True), key=lambda pair: abs(pair[0]))
+        if abs(smallest) < equations.SINGULAR:
+            raise SingularityError(name, smallest)
     return found
 
 
@@ -193,8 +199,7 @@ def _from_angles(
     angles = finite_points("theta", theta)
     missing, *found = by_rows(text, angles)
     if missing.any():
-        a, b, c = angles[missing != 0][0].tolist()
-        raise equations.no_assembly((a, b, c), branch, g)
+        raise equations.no_assembly(first_row(angles, missing != 0), branch, g)
     return found
 
 
@@ -232,15 +237,3 @@ def _conditioning(c: _Configuration) -> Numbers:
     """Compute the conditioning, and 0 where J does not exist."""
     found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
     return c.ns.where(found <= 1.0, found, 0.0)
-
-
-def require_regular(values: FloatArray, geometry: Geometry) -> None:
-    """Raise SingularityError for the smallest factor of det A (..., 3) if it counts as zero."""
-    l4 = geometry.l4
-    names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
-    scaled = [values[..., i].reshape(-1) / (1.0, l4, l4**2)[i] for i in range(3)]
-    if len(scaled[0]):
-        least = [some[abs(some).argmin()].item() for some in scaled]
-        smallest, name = min(zip(least, names, strict=True), key=lambda pair: abs(pair[0]))
-        if abs(smallest) < equations.SINGULAR:
-            raise SingularityError(name, smallest)

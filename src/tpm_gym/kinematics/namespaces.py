@@ -56,9 +56,9 @@ class Namespace:
     solve: Callable[[Any, Any], Any]
 
 
-def namespace_of(value: object) -> Namespace:
-    """Return the namespace for arrays like the argument."""
-    return _torch() if is_tensor(value) else NUMPY
+def namespace_of(*values: object) -> Namespace:
+    """Return the namespace for arrays like the arguments; that of tensors if one is a tensor."""
+    return _torch() if any(map(is_tensor, values)) else NUMPY
 
 
 def _clip(x: Any) -> Any:

@@ -14,7 +14,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, points
+from tpm_gym.arrays import FloatArray, finite_points, first_row, points
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry, require_geometry
 from tpm_gym.kinematics.modes import (
@@ -68,8 +68,7 @@ def inverse(
     solutions = inverse_all(places, geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
-        a, b, c = places[~valid][0].tolist()
-        raise equations.no_posture((a, b, c), branch, geometry)
+        raise equations.no_posture(first_row(places, ~valid), branch, geometry)
     return solutions.theta[..., branch.index, :]
 
 
@@ -79,8 +78,7 @@ def assembled(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> For
     solutions = forward_all(angles, geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
-        a, b, c = angles[~valid][0].tolist()
-        raise equations.no_assembly((a, b, c), branch, geometry)
+        raise equations.no_assembly(first_row(angles, ~valid), branch, geometry)
     return solutions
 
 

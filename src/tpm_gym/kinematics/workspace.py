@@ -72,8 +72,7 @@ def assembly_of(
     Returns:
         (...,) slot, or -1 where the point is not reachable on ``branch``.
     """
-    parallel = factors_at(position, branch, geometry).parallel
-    sin_beta, planar = parallel[..., 0], parallel[..., 2]
+    sin_beta, _, planar, *_ = factors_at(position, branch, geometry)
     slots = 2 * (planar > 0) + 1 * (sin_beta > 0)
-    found: IntArray = namespace_of(parallel).where(planar == planar, slots, -1)
+    found: IntArray = namespace_of(planar).where(planar == planar, slots, -1)
     return found

@@ -96,7 +96,7 @@ class Solid:
             radius, length, _ = self.size
             half = np.full(3, radius)
             half["xyz".index(self.axis)] = length / 2
-        return half if self.rpy == LEVEL else np.asarray(np.abs(rotation_of(self.rpy)) @ half)
+        return np.asarray(np.abs(rotation_of(self.rpy)) @ half)
 
     def _mass(self, size: Vector) -> float:
         if self.kind == "box":

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, is_tensor, numbers, vector
+from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, first_row, numbers, vector
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
@@ -185,17 +185,15 @@ class EquationOfMotion(ABC):
         table = _side_by_side(states)
         missing, *found = by_rows(results, table)
         if missing.any():
-            a, b, c = table[..., :3][missing != 0][0].tolist()
-            raise self._refusal((a, b, c))
+            raise self._refusal(first_row(table[..., :3], missing != 0))
         return found
 
 
 def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
     """Broadcast n arrays (..., 3) with each other, and join them to one (..., 3 n)."""
     arrays = [finite_points(name, state) for name, state in states.items()]
-    like = next((array for array in arrays if is_tensor(array)), arrays[0])
     try:
-        table: FloatArray = namespace_of(like).join(arrays)
+        table: FloatArray = namespace_of(*arrays).join(arrays)
     except (ValueError, RuntimeError) as error:  # numpy's and torch's
         shapes = [tuple(array.shape) for array in arrays]
         valid = "of shapes (..., 3) that go together, by shape"

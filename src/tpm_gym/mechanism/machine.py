@@ -20,7 +20,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, vector
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, first_row, vector
 from tpm_gym.errors import (
     ConfigurationError,
     JointLimitError,
@@ -236,7 +236,7 @@ class Machine(ABC):
         """
         theta = self.inverse(position)
         if np.isnan(theta).any():
-            raise self.unreachable(_first(position, np.isnan(theta[..., 0])))
+            raise self.unreachable(first_row(np.asarray(position), np.isnan(theta[..., 0])))
         return theta
 
     def require_evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
@@ -248,7 +248,7 @@ class Machine(ABC):
         """
         reading = self.evaluate(theta, built)
         if np.isnan(reading.conditioning).any():
-            raise self.unassembled(_first(theta, np.isnan(reading.conditioning)))
+            raise self.unassembled(first_row(np.asarray(theta), np.isnan(reading.conditioning)))
         return reading
 
     def require_within_stops(self, theta: ArrayLike) -> None:
@@ -403,12 +403,6 @@ class Machine(ABC):
                 centre = self.mount.to_world(places[name].point(solid.centre))
                 boxes.append((centre - solid.half_extent, centre + solid.half_extent))
         return boxes
-
-
-def _first(vectors: ArrayLike, chosen: BoolArray) -> Vector:
-    """Return the first of vectors (..., 3) that is chosen (...,)."""
-    x, y, z = np.asarray(vectors, dtype=np.float64)[chosen][0].tolist()
-    return x, y, z
 
 
 _MACHINES: dict[str, Machine | Callable[[], Machine]] = {}

@@ -76,6 +76,13 @@ def motor(
     return Joint(name, "revolute", "base", origin, axis, lower, upper, *line, rpy)
 
 
+def saddles(axis: Literal["x", "y"], centre: Vector) -> list[Solid]:
+    """Build the boxes that hold the housings of a motor (along ``axis``) to the base."""
+    size = (0.06, 0.12, 0.09) if axis == "x" else (0.12, 0.06, 0.09)
+    middles = (displaced("z", -0.06, half) for half in TORQUE_MOTOR.halves(axis, centre))
+    return [Solid("box", size, middle, ALUMINIUM, colour="white") for middle in middles]
+
+
 def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
     """Build an actuated arm: motor's shaft and rotor, rectangular tube, elbow bar across."""
     shaft = bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)

@@ -17,7 +17,7 @@ from typing import Final
 from xml.etree.ElementTree import Comment, Element, SubElement, indent, tostring
 
 from tpm_gym.arrays import Vector
-from tpm_gym.mechanism.bodies import ALONG, LEVEL, Closure, Joint, Link, Mechanism, Solid
+from tpm_gym.mechanism.bodies import LEVEL, Closure, Joint, Link, Mechanism, Solid
 
 _CLOSING = """
   A tree, whose loops are to be closed: {0}.loops.yaml pairs frames whose origins shall coincide.
@@ -165,8 +165,6 @@ def _add_solid(link: Element, tag: str, solid: Solid) -> Element:
 
 def _rpy(solid: Solid) -> Vector:
     """Return roll, pitch and yaw of a box, or of a cylinder along z, in its link, rad."""
-    if solid.rpy == LEVEL:
-        return ALONG[solid.axis] if solid.kind == "cylinder" else LEVEL
     turn = solid.rotation
     pitch = math.asin(max(-1.0, min(1.0, -turn[2, 0])))
     if abs(turn[2, 0]) > 1 - 1e-12:  # roll and yaw turn about one axis: let yaw do it

@@ -112,11 +112,7 @@ def _base(g: DeltaGeometry) -> Link:
         "cylinder", (g.l1 + 0.05, 0.02, 0.0), (0.0, 0.0, -0.105), ALUMINIUM, colour="white"
     )
     pivot = (g.l1, 0.0, 0.0)
-    saddles = [
-        Solid("box", (0.12, 0.06, 0.09), (x, y, z - 0.06), ALUMINIUM, colour="white")
-        for x, y, z in TORQUE_MOTOR.halves("y", pivot)
-    ]
-    housed = (*saddles, *TORQUE_MOTOR.stator("y", pivot))
+    housed = (*parts.saddles("y", pivot), *TORQUE_MOTOR.stator("y", pivot))
     return Link(
         "base", (plate, *(_turned(solid, leg) for leg in LEGS.values() for solid in housed))
     )

@@ -108,21 +108,15 @@ def assembly_at(
     return position, real, height2
 
 
-def posture_at(
-    point: Triple, bends: Triple, g: AnyDelta, ns: Namespace
-) -> tuple[Triple, Numbers, Triple]:
-    """Solve inverse kinematics for the signs of a working mode.
-
-    Returns:
-        theta in (-pi, pi], whether it is real, and whether each leg reaches.
-    """
+def posture_at(point: Triple, bends: Triple, g: AnyDelta, ns: Namespace) -> tuple[Triple, Numbers]:
+    """Compute theta in (-pi, pi] for the signs of a working mode, and whether it is real."""
     inner = g.l2 - g.l1
     (x1, y1, z), (x2, y2, _) = inwards(ONE, point), inwards(TWO, point)
     x3, y3, _ = inwards(THREE, point)
     one, real1 = arm(x1 + inner, z, y1, bends[0], g, ns)
     two, real2 = arm(x2 + inner, z, y2, bends[1], g, ns)
     three, real3 = arm(x3 + inner, z, y3, bends[2], g, ns)
-    return (one, two, three), real1 & real2 & real3, (real1, real2, real3)
+    return (one, two, three), real1 & real2 & real3
 
 
 def pose_at(theta: Triple, side: Numbers, g: AnyDelta, ns: Namespace) -> tuple[Pose, Numbers]:

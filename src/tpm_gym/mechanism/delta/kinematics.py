@@ -69,7 +69,7 @@ def inverse_all(position: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
         found = [posture_at(point, bends, geometry, ns) for bends in WORKING_MODES]
-        return [tuple(_or_nan(real, angles, ns) for angles, real, _ in found)]
+        return [tuple(_or_nan(real, angles, ns) for angles, real in found)]
 
     return by_rows(text, finite_points("position", position))[0]
 
@@ -106,7 +106,7 @@ def factors_at(
 
 
 def _pose_at(point: Triple, bends: Triple, g: AnyDelta, ns: Namespace) -> tuple[Pose, Numbers]:
-    angles, real, _ = posture_at(point, bends, g, ns)
+    angles, real = posture_at(point, bends, g, ns)
     return pose_of(*arms_at(angles, g, ns), point, g), real
 
 

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray, Vector, first_row
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import NUMPY
@@ -68,10 +68,9 @@ class Delta(CompiledMachine):
         # By numpy: machines are made when the package is imported, which must not import Numba.
         slot = WORKING_MODES.index(self.working_mode)
         theta = kinematics.inverse_all(points, self.geometry)[..., slot, :]
-        lost = np.isnan(theta).any(axis=-1)
+        lost = np.isnan(theta[..., 0])
         if lost.any():
-            x, y, z = points[lost][0].tolist()
-            raise self.unreachable((x, y, z))
+            raise self.unreachable(first_row(points, lost))
         side = ASSEMBLY_MODES.index(self.assembly_mode)
         there = kinematics.forward_all(theta, self.geometry)[..., side, :]
         left: NDArray[np.int8] = np.abs(there - points).max(axis=-1) > SAME_PLACE

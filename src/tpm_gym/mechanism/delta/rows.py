@@ -62,8 +62,8 @@ def _inertia(own: FloatArray, j: int) -> Inertia:
 
 
 def _posture(point: Triple, modes: Modes, g: DeltaLengths) -> tuple[Triple, bool]:
-    angles, real, _ = equations.posture_at(point, modes[1:], g, NS)
-    return angles, real
+    found: tuple[Triple, bool] = equations.posture_at(point, modes[1:], g, NS)
+    return found
 
 
 def _pose(theta: Triple, modes: Modes, g: DeltaLengths) -> tuple[Pose, bool, bool]:

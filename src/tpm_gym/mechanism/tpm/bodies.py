@@ -52,12 +52,7 @@ def _base(g: Geometry) -> Link:
         ("y", (g.l1, 0.0, 0.0)),
     )
     motors = [solid for axis, at in pivots for solid in TORQUE_MOTOR.stator(axis, at)]
-    saddles = [
-        Solid("box", (0.06, 0.12, 0.09) if axis == "x" else (0.12, 0.06, 0.09),
-              parts.displaced("z", -0.06, middle), ALUMINIUM, colour="white")
-        for axis, at in pivots
-        for middle in TORQUE_MOTOR.halves(axis, at)
-    ]  # fmt: skip
+    saddles = [solid for axis, at in pivots for solid in parts.saddles(axis, at)]
     return Link("base", (plate, *saddles, *motors))
 
 

@@ -28,16 +28,17 @@ from typing import ClassVar, NamedTuple
 
 from tpm_gym.arrays import Vector
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations, jacobian
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
-from tpm_gym.kinematics.jacobian import factors, require_regular
 from tpm_gym.kinematics.namespaces import Namespace, Numbers
 from tpm_gym.mechanism.equation_of_motion import Energy as Energy
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
 from tpm_gym.mechanism.inertia import swing_force
 from tpm_gym.mechanism.tpm.bodies import build
 from tpm_gym.mechanism.tpm.inertia import Inertia, inertia_of
+
+_Pair = tuple[Numbers, Numbers]
 
 
 class Pose(NamedTuple):
@@ -64,30 +65,6 @@ class Pose(NamedTuple):
     lengths: AnyLengths
 
 
-class Velocities(NamedTuple):
-    """Velocities, m/s: C1 along x and z, P, l7 times the rate of beta, and changes of B_iC_i.
-
-    The change of B2C2 is given along x and z.
-    """
-
-    link3: tuple[Numbers, Numbers]
-    platform: Triple
-    turn: Numbers
-    rod1: Triple
-    rod2: tuple[Numbers, Numbers]
-    rod3: Triple
-
-
-class Accelerations(NamedTuple):
-    """Accelerations, m/s^2: B1 along y and z; B2, B3 and C1 along x and z; P."""
-
-    elbow1: tuple[Numbers, Numbers]
-    elbow2: tuple[Numbers, Numbers]
-    elbow3: tuple[Numbers, Numbers]
-    link3: tuple[Numbers, Numbers]
-    platform: Triple
-
-
 def pose_at(
     theta: Triple, signs: tuple[Numbers, ...], g: AnyLengths, ns: Namespace
 ) -> tuple[Pose, Numbers]:
@@ -105,23 +82,17 @@ def pose_at(
 
 
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
-    """Compute the torques for rates (rad/s), their changes (rad/s^2) and gravity (m/s^2)."""
-    v = velocities(pose, rates)
-    return carried(pose, v, changes, accelerations(pose, rates, changes, v), gravity, m)
-
-
-def carried(
-    pose: Pose, v: Velocities, changes: Triple, a: Accelerations, gravity: Triple, m: Inertia
-) -> Triple:
-    """Compute the motors' torques for velocities and accelerations of the points.
+    """Compute the torques for rates (rad/s), their changes (rad/s^2) and gravity (m/s^2).
 
     Weight equals the inertial force of an additional acceleration by -gravity.
     """
-    (c1, c2, c3), (s1, s2, s3), (r1, _, r3) = pose.cos, pose.sin, pose.rods
-    (b1y, b1z), (b2x, b2z), (b3x, b3z), (cx, cz), (px, py, pz) = a
-    f1x, f1y, f1z = swing_force(r1, v.rod1, (-b1y, cz - b1z), m.swing1)
+    turn, moved = velocities(pose, rates)
+    elbows, (cx, cz), (px, py, pz) = accelerations(pose, rates, changes, turn, moved)
+    (c1, c2, c3), (s1, s2, s3), (r1, _, r3), (d1, _, d3) = pose.cos, pose.sin, pose.rods, moved
+    (b1y, b1z), (b2x, b2z), (b3x, b3z) = elbows
+    f1x, f1y, f1z = swing_force(r1, d1, (-b1y, cz - b1z), m.swing1)
     f3y, f3x, f3z = swing_force(
-        (r3[1], r3[0], r3[2]), (v.rod3[1], v.rod3[0], v.rod3[2]), (px - b3x, pz - b3z), m.swing3
+        (r3[1], r3[0], r3[2]), (d3[1], d3[0], d3[2]), (px - b3x, pz - b3z), m.swing3
     )
     gx, gy, gz = gravity
     cx, cz, px, py, pz = cx - gx, cz - gz, px - gx, py - gy, pz - gz
@@ -196,40 +167,47 @@ def potential(pose: Pose, gravity: Triple, m: Inertia) -> Numbers:
     )
 
 
-def velocities(pose: Pose, rates: Triple) -> Velocities:
-    """Compute velocities from the first derivatives of the closures."""
+def velocities(pose: Pose, rates: Triple) -> tuple[Numbers, tuple[Triple, Triple, Triple]]:
+    """Compute l7 times the rate of beta, and the changes of B_iC_i, m/s.
+
+    They follow from the first derivatives of the closures.
+    """
     (c1, c2, c3), (s1, s2, s3), (u1, u2, u3), f = pose.cos, pose.sin, rates, pose.factors
     x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
     px, py = x - f.sin_beta * turn, f.cos_beta * turn
-    return Velocities(
-        (x, z),
-        (px, py, z),
-        turn,
-        (x, s1 * u1, z - c1 * u1),
-        (x + s2 * u2, z - c2 * u2),
-        (px + s3 * u3, py, z - c3 * u3),
-    )
+    rod1, rod2 = (x, s1 * u1, z - c1 * u1), (x + s2 * u2, 0.0, z - c2 * u2)
+    return turn, (rod1, rod2, (px + s3 * u3, py, z - c3 * u3))
 
 
-def accelerations(pose: Pose, rates: Triple, changes: Triple, v: Velocities) -> Accelerations:
-    """Compute accelerations from the second derivatives of the closures."""
+def accelerations(
+    pose: Pose,
+    rates: Triple,
+    changes: Triple,
+    turn: Numbers,
+    moved: tuple[Triple, Triple, Triple],
+) -> tuple[tuple[_Pair, _Pair, _Pair], _Pair, Triple]:
+    """Compute accelerations, m/s^2, from the second derivatives of the closures.
+
+    Returns:
+        B1 along y and z, B2 and B3 along x and z; C1 along x and z; P.
+    """
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (_, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = pose.rods
     (u1, u2, u3), (a1, a2, a3) = rates, changes
-    (d1x, d1y, d1z), (d2x, d2z), (d3x, d3y, d3z) = v.rod1, v.rod2, v.rod3
+    (d1x, d1y, d1z), (d2x, _, d2z), (d3x, d3y, d3z) = moved
     b1y, b1z = -s1 * a1 - c1 * u1 * u1, c1 * a1 - s1 * u1 * u1
     b2x, b2z = -s2 * a2 - c2 * u2 * u2, c2 * a2 - s2 * u2 * u2
     b3x, b3z = -s3 * a3 - c3 * u3 * u3, c3 * a3 - s3 * u3 * u3
-    inwards = v.turn * v.turn / pose.lengths.l7
+    inwards = turn * turn / pose.lengths.l7
     ex, ey = inwards * f.cos_beta, inwards * f.sin_beta
-    x, z, turn = _resolve(
+    x, z, turning = _resolve(
         pose,
         r1y * b1y + r1z * b1z - d1x * d1x - d1y * d1y - d1z * d1z,
         r2x * b2x + r2z * b2z - d2x * d2x - d2z * d2z,
         r3x * (b3x + ex) + r3y * ey + r3z * b3z - d3x * d3x - d3y * d3y - d3z * d3z,
     )
-    platform = (x - f.sin_beta * turn - ex, f.cos_beta * turn - ey, z)
-    return Accelerations((b1y, b1z), (b2x, b2z), (b3x, b3z), (x, z), platform)
+    platform = (x - f.sin_beta * turning - ex, f.cos_beta * turning - ey, z)
+    return ((b1y, b1z), (b2x, b2z), (b3x, b3z)), (x, z), platform
 
 
 def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
@@ -242,7 +220,7 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
     return x, z, (h3 - r3x * x - r3z * z) * pose.per_k
 
 
-def gather(pose: Pose, at_c: tuple[Numbers, Numbers], at_p: Triple) -> Triple:
+def gather(pose: Pose, at_c: _Pair, at_p: Triple) -> Triple:
     """Compute the torques that balance forces (N) at C1 (x, z) and at P (transposed Jacobians)."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
@@ -276,8 +254,7 @@ class Dynamics(EquationOfMotion):
 
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
         try:
-            found = factors(theta, self.branch, self.geometry)
-            require_regular(found.parallel, self.geometry)
+            jacobian.velocity(theta, self.branch, self.geometry)
         except (UnreachableError, SingularityError) as error:
             return error
         raise AssertionError(theta)

@@ -64,8 +64,7 @@ class TPM(CompiledMachine):
     def unassembled(self, theta: Vector) -> UnreachableError | SingularityError:
         """See :class:`Machine`."""
         try:
-            found = jacobian.factors(theta, self.assembly_mode, self.geometry)
-            jacobian.require_regular(found.parallel, self.geometry)
+            jacobian.velocity(theta, self.assembly_mode, self.geometry)
         except (UnreachableError, SingularityError) as error:
             return error
         hint = "choose joint angles on the machine's side of y = l7"

@@ -18,7 +18,6 @@ from tpm_gym.mechanism.tpm.inertia import Inertia
 compilable(
     dynamics.pose_at,
     dynamics.torques,
-    dynamics.carried,
     dynamics.masses,
     dynamics.velocity,
     dynamics.velocities,
