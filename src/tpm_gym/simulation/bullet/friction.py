@@ -14,8 +14,9 @@ be as slippery as ice. So this module adds the missing friction as a force, from
 
 Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
 by one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
-the slip direction of its middle, so that friction brakes a spinning block too little. Contacts
-between objects keep the box, and upright ones have no friction in a steady push.
+the mean of their scales, so that friction brakes a spinning block too little, and sideways motion of
+a block that spins and slides. Contacts between objects keep the box, and upright ones have no
+friction in a steady push.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import pybullet
 
@@ -57,6 +58,38 @@ class _Face:
     def __init__(self, body: int, link: int) -> None:
         self.body, self.link = body, link
         self.scales, self.speed = _BOX, 0.0
+
+
+class _Motion(NamedTuple):
+    """Place (m), velocity (m/s) and angular velocity (rad/s) of an object."""
+
+    place: Vector
+    velocity: Vector
+    turning: Vector
+
+    @classmethod
+    def of(cls, body: int, number: int) -> _Motion:
+        """Read the motion of a body."""
+        place, _ = pybullet.getBasePositionAndOrientation(body, number)
+        return cls(place, *pybullet.getBaseVelocity(body, number))
+
+    def slip(
+        self, other: tuple[float, float], points: Sequence[Any]
+    ) -> tuple[tuple[float, float], float]:
+        """Return the scales for the slip of contact points, and its mean speed in m/s.
+
+        Points of a spinning object slip in different directions, but share the scales.
+        """
+        (x, y, z), (u, v, _), (p, q, r) = self
+        along_x = along_y = speed = total = 0.0
+        for point in points:
+            (a, b, c), weight = point[5], max(point[9], 1e-9)
+            slip_x = u - other[0] + q * (c - z) - r * (b - y)
+            slip_y = v - other[1] + r * (a - x) - p * (c - z)
+            scale_x, scale_y = _along(slip_x, slip_y)
+            along_x, along_y = along_x + weight * scale_x, along_y + weight * scale_y
+            speed, total = speed + weight * math.hypot(slip_x, slip_y), total + weight
+        return (along_x / total, along_y / total), speed / total
 
 
 class Friction:
@@ -147,6 +180,7 @@ class Friction:
                 u, v, _ = self._lip_velocity()
                 if math.hypot(u, v) > _FAST:  # a strike would make the object slip along (u, v)
                     self._set(table, _along(u, v))
+                    self._set(cup, _BOX)
                 continue
             points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with all other bodies
             if not points:
@@ -154,23 +188,19 @@ class Friction:
             below = [point for point in points if point[2] == table.body]
             lip = [point for point in points if point[2] == cup.body and point[4] == cup.link]
             beside = [point for point in lip if abs(point[7][2]) < _LEVEL]
-            (x, y, _), (p, q, _) = pybullet.getBaseVelocity(body, number)
-            half, rough = block.height / 2, self._factor * block.friction
+            rough, motion = self._factor * block.friction, _Motion.of(body, number)
             if below:
-                self._set(table, _scales(x - half * q, y + half * p, below, rough))
+                self._set(table, _scales(motion, (0.0, 0.0), below, rough))
             if self._belts:
                 belt = self._belts[index]
                 if on_belt := [point for point in points if point[2] == belt.body]:
-                    slip = x - half * q - belt.speed, y + half * p
-                    self._set(belt, _scales(*slip, on_belt, rough))
+                    self._set(belt, _scales(motion, (belt.speed, 0.0), on_belt, rough))
             if beside:
                 self._set(cup, _BOX)
                 self._pushes[index] = self._resist(body, beside, push, rough * CUP.friction)
             elif lip and index != held:
                 u, v, _ = self._lip_velocity()
-                self._set(
-                    cup, _scales(x + half * q - u, y - half * p - v, lip, rough * CUP.friction)
-                )
+                self._set(cup, _scales(motion, (u, v), lip, rough * CUP.friction))
 
     def _lip_velocity(self) -> Vector:
         state = pybullet.getLinkState(self._cup.body, self._cup.link, 1, 0, self._number)
@@ -191,9 +221,9 @@ class Friction:
         number, cup, point = self._number, self._cup, max(points, key=lambda point: point[9])
         normal = sum(point[9] for point in points)
         solved = sum(math.hypot(point[10], point[12]) for point in points)
-        place, _ = pybullet.getBasePositionAndOrientation(body, number)
         mass, _, moments, *_ = pybullet.getDynamicsInfo(body, -1, number)
-        motion = *pybullet.getBaseVelocity(body, number), self._lip_velocity()
+        place, *own = _Motion.of(body, number)
+        motion = *own, self._lip_velocity()
         contact, most = (point[5], point[7], place), coefficient * normal - solved
         before, limit = last[0], min(last[1], most)
         force, back, after = self._friction_force(
@@ -227,22 +257,31 @@ class Friction:
             self._scale(face.body, face.link, anisotropicFriction=(a, b, 1.0))
 
 
-def _scales(x: float, y: float, points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Return the friction limits along x and y (world) in units of mu N, for a slip (x, y) m/s."""
-    speed = math.hypot(x, y)
+def _scales(
+    motion: _Motion, other: tuple[float, float], points: Sequence[Any], coefficient: float
+) -> tuple[float, float]:
+    """Return the friction limits along x and y (world) in units of mu N.
+
+    Args:
+        motion: Motion of the object.
+        other: Velocity of the other body along x and y, m/s.
+        points: PyBullet's contact points.
+        coefficient: Coulomb's coefficient.
+    """
+    (x, y), speed = motion.slip(other, points)
     if speed > _FAST:
-        return _along(x, y)
+        return x, y
     a, b = _used(points, coefficient)
     if a * a + b * b < _LITTLE:
         return _UNKNOWN
     if a * a + b * b < _STICKS:
         return math.sqrt(1 - b * b), math.sqrt(1 - a * a)
-    return _along(x, y) if speed > _SLIP else _along(a, b)
+    return (x, y) if speed > _SLIP else _along(a, b)
 
 
 def _along(x: float, y: float) -> tuple[float, float]:
     """Return the scales whose corner of the box lies on the cone along (x, y)."""
-    length = math.hypot(x, y)
+    length = max(math.hypot(x, y), 1e-12)
     return max(abs(x) / length, _LEAST), max(abs(y) / length, _LEAST)
 
 
