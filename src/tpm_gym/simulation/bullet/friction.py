@@ -14,8 +14,8 @@ be as slippery as ice. So this module adds the missing friction as a force, from
 
 Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
 by one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
-the mean of their scales, so that friction brakes a spinning block too little, and sideways motion of
-a block that spins and slides. Contacts between objects keep the box, and upright ones have no
+the mean of their scales. So friction brakes too little the spin of a block, and the sideways motion
+of a block that spins and slides. Contacts between objects keep the box, and upright ones have no
 friction in a steady push.
 """
 
