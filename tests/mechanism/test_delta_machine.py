@@ -1,4 +1,7 @@
-"""The Delta against root finders, differences, published numbers, its bodies and Pinocchio."""
+"""The Delta against root finders, differences, published numbers and its bodies.
+
+Pinocchio computes its torques in test_pinocchio.py.
+"""
 
 import importlib
 from dataclasses import replace
@@ -15,7 +18,6 @@ from tpm_gym.mechanism.closures import closure_jacobian, moving_joints
 from tpm_gym.mechanism.delta import kinematics
 from tpm_gym.mechanism.delta.geometry import ASSEMBLY_MODES, IRB_360, WORKING_MODES, DeltaGeometry
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.mechanism.urdf import loops_text, urdf_text
 
 TURNS = 2 * np.pi / 3 * np.arange(3)
 OUT = np.stack([np.cos(TURNS), np.sin(TURNS), np.zeros(3)], axis=-1)
@@ -381,61 +383,6 @@ def test_compiled_dynamics_are_the_equations():
     bias = DELTA.dynamics.torque(theta, rates, np.zeros(3))
     np.testing.assert_allclose(motion.bias, bias, rtol=1e-9)
     assert motion.working.all()
-
-
-def test_pinocchio_agrees_on_closures_masses_and_torques(tmp_path):
-    """Measured: closures 1e-9 m, masses and torques 1e-7 of the largest: the digits of the URDF."""
-    pin = pytest.importorskip("pinocchio", reason="Pinocchio has no wheels for Windows")
-    yaml = pytest.importorskip("yaml")
-    mechanism = DELTA.mechanism
-    model = pin.buildModelFromXML(urdf_text(mechanism, closure_frames=True))
-    loops = yaml.safe_load(loops_text(mechanism))
-    model.gravity.linear = np.array(DELTA.mount.free_fall)
-    data = model.createData()
-    joints = list(model.names[1:])
-    columns = [int(model.joints[model.getJointId(name)].idx_v) for name in joints]
-    at = dict(zip(joints, columns, strict=True))
-    driven = [at[name] for name in loops["name_mot"]]
-    passive_joints = [c for name, c in at.items() if name not in (*loops["name_mot"], "cup_slide")]
-    pairs = [[model.getFrameId(name) for name in pair] for pair in loops["closed_loop"]]
-
-    axes = pin.LOCAL_WORLD_ALIGNED
-
-    def gap(of):
-        return np.concatenate([of(a) - of(b) for a, b in pairs])
-
-    def place_of(frame):
-        return data.oMf[frame].translation
-
-    def velocity_of(frame):
-        return pin.getFrameJacobian(model, data, frame, axes)[:3]
-
-    def acceleration_of(frame):
-        return pin.getFrameClassicalAcceleration(model, data, frame, axes).linear
-
-    for theta, rate, change in zip(*motions(5), strict=True):
-        turn = np.zeros(model.nv)
-        for name, value in DELTA.joint_positions(tuple(theta.tolist())).items():
-            turn[at[name]] = value
-        posture = pin.integrate(model, pin.neutral(model), turn)
-        pin.computeJointJacobians(model, data, posture)
-        pin.updateFramePlacements(model, data)
-        assert np.abs(gap(place_of)).max() < 1e-8
-        rows = gap(velocity_of)
-        carried = np.zeros((model.nv, 3))
-        carried[driven] = np.eye(3)
-        carried[passive_joints] = -np.linalg.solve(rows[:, passive_joints], rows[:, driven])
-        mass = pin.crba(model, data, posture)
-        mass = np.triu(mass) + np.triu(mass, 1).T
-        expected = carried.T @ mass @ carried
-        found = DELTA.motion(theta[None], rate[None]).mass[0]
-        np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
-        v, a = carried @ rate, carried @ change
-        pin.forwardKinematics(model, data, posture, v, a)
-        a[passive_joints] -= np.linalg.solve(rows[:, passive_joints], gap(acceleration_of))
-        torque = carried.T @ pin.rnea(model, data, posture, v, a)
-        found = DELTA.torque(theta, rate, change)
-        assert np.abs(found - torque).max() < 1e-6 * np.abs(torque).max()
 
 
 # Mutations
