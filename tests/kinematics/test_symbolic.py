@@ -117,32 +117,6 @@ def test_eq_16_factors_are_the_determinant_of_the_closures():
     assert_zero(parallel.det() - 8 * l7 * product(PARALLEL))
 
 
-def turned_closures(phi: Any) -> list[Any]:
-    """Of both rods 4, of rod 6 and of branch III, where link 3' is turned by phi about y."""
-    along, up = column(sp.cos(phi), 0, -sp.sin(phi)), column(sp.sin(phi), 0, sp.cos(phi))
-    e1 = C1 + l6 * up + l7 * (sp.cos(beta) * along + sp.sin(beta) * column(0, 1, 0))
-    level = l5 * column(1, 0, 0)
-    rods = [
-        (C1 + l5 * along) - (B[0] + level),
-        (C1 - l5 * along) - (B[0] - level),
-        (C1 - 2 * l5 * along) - B[1],
-        (e1 + 2 * l2 * along) - B[2],  # C3 = E1 + (E1F1 - C3D3) + F1D3
-    ]
-    return [rod.dot(rod) - l4**2 for rod in rods]
-
-
-def test_the_complete_determinant_has_the_constraint_as_a_fourth_factor():
-    """Eq. (16) takes for granted that link 3' translates; let it turn, and z_C1 - z_B1 appears."""
-    phi = sp.Symbol("phi", real=True)
-    closures = turned_closures(phi)
-    difference = closures[0] - closures[1]
-    turn = {sp.cos(phi): (1 - half**2) / (1 + half**2), sp.sin(phi): 2 * half / (1 + half**2)}
-    expected = -8 * half * l5 * (half * x_c + CONSTRAINT) / (1 + half**2)
-    assert_zero(difference.subs(turn) - expected)
-    complete = sp.Matrix(closures).jacobian([x_c, z_c, phi, beta]).subs(phi, 0)
-    assert_zero(complete.det() + 32 * l5 * CONSTRAINT * l7 * product(PARALLEL))
-
-
 def test_eq_17_factors_are_the_derivatives_by_the_motors():
     serial = sp.Matrix(CLOSURES).jacobian(THETA)
     assert serial.is_diagonal()
