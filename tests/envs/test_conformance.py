@@ -24,6 +24,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlace-v0", {"engine": "mujoco", "randomisation": EVERYTHING}),
     ("TPMPickAndPlaceJointsDense-v0", {"engine": "mujoco", "machine": "wide", "drive": "servo"}),
     ("TPMPickAndPlace-v0", {"engine": "mujoco", "machine": "gantry"}),
+    ("TPMConveyorDense-v0", {"engine": "mujoco"}),
+    ("TPMPickAndPlaceDense-v0", {"engine": "analytic", "machine": "delta"}),
     ("TPMReachJointsDense-v0", {"engine": "analytic"}),
     ("TPMPickAndPlace-v0", {"engine": "analytic", "randomisation": EVERYTHING}),
     ("TPMPickAndPlaceJoints-v0", {"engine": "analytic", "machine": "wide"}),
