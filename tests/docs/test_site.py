@@ -1,10 +1,8 @@
 """The documentation site: pages made from code, links to code, and the build."""
 
-import subprocess
-import sys
-
 import pytest
 from paths import ROOT
+from processes import PYTHON, printed_by
 from registries import registries_put_back
 
 from tpm_gym.tasks.registry import TASKS
@@ -99,8 +97,7 @@ def test_the_list_of_tasks_has_a_sentence_for_each():
 
 @pytest.mark.slow
 def test_the_site_builds_without_warnings(tmp_path):
-    command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "--nitpicky"]
-    built = subprocess.run([*command, "docs", tmp_path], cwd=ROOT, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
+    options = ("-E", "-W", "--keep-going", "--nitpicky")
+    printed_by(PYTHON, "-m", "sphinx", *options, "docs", tmp_path, cwd=ROOT)
     for page in ("index", "api/tpm_gym", "generated/tasks/reach"):
         assert (tmp_path / f"{page}.html").exists()
