@@ -290,17 +290,6 @@ each_drive = pytest.mark.parametrize("drive", [None, Servo()], ids=["ideal", "se
 
 @each_drive
 @each_engine
-def test_motors_without_torque_let_the_arm_fall(engine, drive):
-    simulation = Alone(Scene(), engine=engine, drive=drive)
-    before = simulation.reset(THETA, plant=NO_TORQUE)
-    settle(simulation, HOME, 2)
-    state = simulation.read()
-    np.testing.assert_allclose(torques(simulation), 0, atol=1e-6)
-    assert before.platform_position[2] - state.platform_position[2] > 0.01
-
-
-@each_drive
-@each_engine
 def test_no_command_draws_more_than_the_motors_have(engine, drive):
     simulation, drawn = Alone(Scene(), engine=engine, drive=drive), list[FloatArray]()
     simulation.reset(THETA, plant=Plant(motor_strength=(0.5, 0.5, 0.5)))

@@ -100,18 +100,6 @@ def test_loops_stay_closed_and_the_platform_stays_at_the_forward_kinematics(engi
         assert not state.passed_singularity
 
 
-@each_machine
-def test_the_platform_comes_to_rest_at_the_command(machine):
-    simulation = Alone(Scene(), machine=machine)
-    simulation.reset(machine.inverse(machine.home))
-    target = anywhere(machine, 1, seed=9)[0]
-    state = follow(simulation, np.linspace(machine.home, target, 20).tolist() + [target] * 20)[-1]
-    world = machine.mount.to_world(target)
-    np.testing.assert_allclose(state.platform_position, world, atol=2e-4)
-    np.testing.assert_allclose(state.command, world, atol=1e-12)
-    assert np.abs(state.theta_dot).max() < 1e-3
-
-
 def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):
     simulation.reset(THETA)
     states = follow(simulation, [HOME + (0.01 * k, 0.0, -0.005 * k) for k in range(12)])
