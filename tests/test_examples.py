@@ -16,10 +16,7 @@ PRINTED = {
         None,
         r"Jacobian against differences: \S+e-(0[7-9]|1\d) m/rad\n(y = .*\n){4}83\.4% of",
     ),
-    "own_block_task": (
-        None,
-        r"expert: (9[5-9]\.\d|100\.0)% of 200 episodes, in the wall 0\.0%",
-    ),
+    "own_block_task": (None, r"expert: (9[5-9]\.\d|100\.0)% of 200 episodes, in the wall 0\.0%"),
     "own_machine": (None, r"the expert succeeds in (9\d|100) of 100 episodes"),
     "own_task": (None, r"expert: (9\d\.\d|100\.0)% of 200 episodes"),
     "ppo_analytic": ("4096", r"4,096 steps in \d+ s\nsuccess at the end: [\d.]+% of 500"),
@@ -41,8 +38,7 @@ LONG = "behaviour_cloning"  # plays 40,000 steps of the expert and of the networ
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == LONG)) for name in PRINTED],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == LONG)) for name in PRINTED]
 )
 def test_an_example_runs(name, tmp_path):
     steps, pattern = PRINTED[name]

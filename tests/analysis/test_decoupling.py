@@ -11,14 +11,7 @@ from gantry import GANTRY
 from paths import ROOT
 from torch.autograd.functional import jacobian as derivatives
 
-from tpm_gym.analysis.decoupling import (
-    LINKS,
-    PLATFORM,
-    link_velocity,
-    motors,
-    over,
-    shares,
-)
+from tpm_gym.analysis.decoupling import LINKS, PLATFORM, link_velocity, motors, over, shares
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse, jacobian

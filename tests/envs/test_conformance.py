@@ -100,8 +100,7 @@ class Eager(Reach):
 
 
 @pytest.mark.parametrize(
-    ("task", "promise"),
-    [(Unseeded, "the checkers of Gymnasium"), (Eager, "the goal's term is 0")],
+    ("task", "promise"), [(Unseeded, "the checkers of Gymnasium"), (Eager, "the goal's term is 0")]
 )
 def test_what_does_not_keep_it_is_found(task, promise):
     with pytest.raises(ConformanceError, match=promise) as caught:

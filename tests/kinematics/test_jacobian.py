@@ -10,14 +10,7 @@ from torch.autograd.functional import jacobian as derivatives
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import SingularityError
-from tpm_gym.kinematics import (
-    ASSEMBLY_MODES,
-    ELBOWS_OUT,
-    AssemblyMode,
-    forward,
-    inverse,
-    jacobian,
-)
+from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, AssemblyMode, forward, inverse, jacobian
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
 

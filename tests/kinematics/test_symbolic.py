@@ -127,9 +127,7 @@ def test_eq_17_factors_are_the_derivatives_by_the_motors():
 def test_determinants_of_a_and_b_are_products_of_the_factors():
     """A and B in the velocity of P: rows 1 and 2 times cos(beta), with y = l7 sin(beta)."""
     cos, sin = sp.cos(beta), sp.sin(beta)
-    a = sp.Matrix(
-        [[cos * r[0], sin * r[0], cos * r[2]] for r in RODS[:2]] + [list(RODS[2])],
-    )
+    a = sp.Matrix([[cos * r[0], sin * r[0], cos * r[2]] for r in RODS[:2]] + [list(RODS[2])])
     b = sp.diag(cos * SERIAL[1], cos * SERIAL[2], SERIAL[3])
     # Each row is what its closure says about the velocities of P and of the motors.
     p_rates = P.jacobian([x_c, z_c, beta])

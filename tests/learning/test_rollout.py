@@ -17,12 +17,7 @@ from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import bootstrap, wilson
 from tpm_gym.learning.policies import NoisyPolicy, load_policy
-from tpm_gym.learning.rollout import (
-    TEST_SEED,
-    Episode,
-    run_episodes,
-    summarise,
-)
+from tpm_gym.learning.rollout import TEST_SEED, Episode, run_episodes, summarise
 
 PICK = "TPMPickAndPlace-v0"
 

@@ -18,15 +18,7 @@ import torch
 from paths import ROOT
 from processes import PYTHON, signalled
 from stable_baselines3 import SAC
-from trainings import (
-    CASES,
-    evaluations,
-    make_config,
-    quiet,
-    said,
-    table,
-    uninterrupted,
-)
+from trainings import CASES, evaluations, make_config, quiet, said, table, uninterrupted
 
 import tpm_gym
 from tpm_gym.errors import TPMError
@@ -224,10 +216,7 @@ def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run):
 @pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(
     ("number", "status"),
-    [
-        (signal.SIGINT, 130),
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
-    ],
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
 )
 def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(tmp_path, number, status):
     """Signal the whole process group, workers included, as a terminal or a batch system does."""

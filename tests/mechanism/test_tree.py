@@ -22,12 +22,7 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.mechanism.tpm.bodies import (
-    ACTUATED_JOINTS,
-    build,
-    joint_angles,
-    rotated_joint_angles,
-)
+from tpm_gym.mechanism.tpm.bodies import ACTUATED_JOINTS, build, joint_angles, rotated_joint_angles
 
 GAP = 1e-9
 # Link of the paper's Fig. 1 -> bodies; 3 is rigid with arm 2, 8 with platform 1.

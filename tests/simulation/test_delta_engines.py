@@ -26,10 +26,7 @@ def test_the_expert_succeeds_with_closed_loops(engine):
         assert info["is_success"]
 
 
-@pytest.mark.parametrize(
-    ("env_id", "limit"),
-    [("TPMReach-v0", 1e-4), ("TPMPickAndPlace-v0", 5e-3)],
-)
+@pytest.mark.parametrize(("env_id", "limit"), [("TPMReach-v0", 1e-4), ("TPMPickAndPlace-v0", 5e-3)])
 def test_engines_agree_on_the_torques(env_id, limit):
     """Measured by rms: 0.001% without contact, 0.24% in 1,000 episodes of pick-and-place."""
     torques = {}
