@@ -7,7 +7,7 @@ body. For a slipping contact, this module scales them so that a corner of the bo
 opposite to the slip. For a sticking contact, the limit along x follows from the cone and the last
 force along y, and vice versa. Without a last force, the box lies inside the cone.
 
-Remaining errors, measured in ``tests/simulation/bullet/test_friction.py``: the direction lags by
+Remaining errors, measured in ``tests/simulation/test_friction.py``: the direction lags by
 one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
 the slip direction of its middle, so that friction brakes a spinning block too little. Contacts
 between objects and contacts with upright faces keep the box.
