@@ -71,13 +71,6 @@ def test_same_seed_same_policy_whatever_is_evaluated(run, tmp_path):
     assert not equal(parameters(run), parameters(tmp_path / "other"))
 
 
-def test_a_learning_rate_falls_to_zero_if_asked_to(run):
-    rates = [float(row["train/learning_rate"]) for row in table(run) if row["train/learning_rate"]]
-    assert 0.0001 < rates[0] < 0.0002  # about half way
-    assert rates == sorted(rates, reverse=True)
-    assert 0 <= rates[-1] <= 0.0003 * 2 / 300  # an update takes two steps
-
-
 def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_path):
     """With 100 steps there are three rollouts of 40; the rate falls by a third after each."""
     config = make_config("ppo", tmp_path)

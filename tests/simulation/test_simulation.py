@@ -1,6 +1,6 @@
 """The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from states import apart
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Block, Scene, Servo, State
+from tpm_gym.simulation import Block, Scene, Servo
 from tpm_gym.simulation.engine import spline_weights
 
 HOME = np.array(PAPER_TPM.home)
@@ -53,15 +53,6 @@ def test_scenes_that_cannot_be_are_refused(name, value):
     with pytest.raises(ConfigurationError) as caught:
         Scene(**{name: value})
     assert caught.value.name == name
-
-
-@pytest.mark.parametrize("blocks", [(), (Block("one"), Block("other"))], ids=len)
-def test_a_state_has_all_of_its_attributes_and_no_other(blocks):
-    simulation = Alone(Scene(objects=blocks))
-    places = {block.name: (0.1 * i, -0.03, 0.015) for i, block in enumerate(blocks)}
-    state = simulation.reset(THETA, places)
-    assert [*vars(state)] == [field.name for field in fields(State)]
-    assert state.object_quaternion.shape == (len(blocks), 4)
 
 
 # -- the mechanism ---------------------------------------------------------------------------------
