@@ -61,10 +61,6 @@ def assert_zero(expression: Any) -> None:
     assert sp.simplify(sp.expand(expression)) == 0
 
 
-def product(factors: list[Any]) -> Any:
-    return sp.prod(factors)
-
-
 def test_eq_7_is_the_difference_of_the_two_lines_of_eq_6():
     a1, b1 = 2 * (B[1][0] + 2 * l5), 2 * (B[1][2] - B[0][2])
     c1 = (B[1][0] + 2 * l5) ** 2 + B[1][2] ** 2 - B[0][1] ** 2 - B[0][2] ** 2
@@ -114,7 +110,7 @@ def test_eqs_13_and_15_corrected_are_the_closures_in_the_half_angle(leg):
 
 def test_eq_16_factors_are_the_determinant_of_the_closures():
     parallel = sp.Matrix(CLOSURES).jacobian([x_c, z_c, beta])
-    assert_zero(parallel.det() - 8 * l7 * product(PARALLEL))
+    assert_zero(parallel.det() - 8 * l7 * sp.prod(PARALLEL))
 
 
 def test_eq_17_factors_are_the_derivatives_by_the_motors():
@@ -135,8 +131,8 @@ def test_determinants_of_a_and_b_are_products_of_the_factors():
         by_links = sp.Matrix([CLOSURES[leg]]).jacobian([x_c, z_c, beta]) / 2
         assert sp.simplify((a[leg, :] * p_rates - scale * by_links).expand()) == sp.zeros(1, 3)
         assert_zero(b[leg, leg] + scale * sp.diff(CLOSURES[leg], THETA[leg]) / 2)
-    assert_zero(a.det() + cos * product(PARALLEL))
-    assert_zero(b.det() - cos * product(SERIAL))
+    assert_zero(a.det() + cos * sp.prod(PARALLEL))
+    assert_zero(b.det() - cos * sp.prod(SERIAL))
 
 
 SYMBOLIC = {
