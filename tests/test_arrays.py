@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tpm_gym.arrays import (
-    finite,
-    finite_points,
-    numbers,
-    points,
-    rotate,
-    vector,
-)
+from tpm_gym.arrays import finite, finite_points, numbers, points, rotate, vector
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError
 from tpm_gym.simulation.engine import transform

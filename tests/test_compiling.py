@@ -13,7 +13,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
-from processes import printed_by
+from processes import PYTHON, printed_by
 
 from tpm_gym import compiling
 
@@ -87,6 +87,12 @@ def called() -> tuple[float, int]:
     return function(1.5), sum(function.stats.cache_hits.values())
 
 
+def environment_of(folder: Path) -> dict[str, str]:
+    """Return the variables of another process that imports from and keeps code in the folder."""
+    paths = os.pathsep.join([str(folder), *sys.path])
+    return os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": paths}
+
+
 def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes(folder):
     assert [called(), called()] == [(3.0, 0), (3.0, 1)]
     (folder / "own/other.py").write_text("OTHER = 2\n")
@@ -100,13 +106,9 @@ def test_a_kept_function_is_compiled_again_when_what_is_compiled_into_it_changes
 def test_a_function_that_was_compiled_without_bytecode_is_found_with_it(folder):
     (folder / "own/main.py").write_text(NESTED)
     code = "from own.main import apply; print(apply(1.5), sum(apply.stats.cache_hits.values()))"
-    paths = os.pathsep.join([str(folder), *sys.path])
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": paths}
+    environment = environment_of(folder)
     environment.pop("PYTHONDONTWRITEBYTECODE", None)
-    found = [
-        subprocess.check_output([sys.executable, "-c", code], env=environment, text=True)
-        for _ in range(2)
-    ]
+    found = [printed_by(PYTHON, "-c", code, env=environment) for _ in range(2)]
     assert found == ["3.0 0\n", "3.0 1\n"]
 
 
@@ -175,18 +177,14 @@ def test_the_stamp_covers_other_packages_and_modules_as_arguments(folder, file, 
     assert compiling.stamp(laws(folder).loop()) != before
 
 
-def test_a_default_is_in_the_stamp(folder):
+def test_defaults_and_the_options_of_compiling_are_in_the_stamp(folder, monkeypatch):
     main = laws(folder)
-    before = compiling.stamp(main.loop())
+    stamps = [compiling.stamp(main.loop())]
     main.named.__defaults__ = (0.25,)
-    assert compiling.stamp(main.loop()) != before
-
-
-def test_options_of_compiling_are_in_the_stamp(folder, monkeypatch):
-    function = laws(folder).loop()
-    before = compiling.stamp(function)
+    stamps.append(compiling.stamp(main.loop()))
     monkeypatch.setattr(compiling, "__file__", str(folder / "own/law.py"))
-    assert compiling.stamp(function) != before
+    stamps.append(compiling.stamp(main.loop()))
+    assert len(set(stamps)) == 3
 
 
 def test_a_source_that_is_edited_after_its_import_does_not_spoil_what_is_kept(folder):
@@ -229,11 +227,9 @@ def test_where_nothing_can_be_kept_functions_are_compiled_all_the_same(folder):
 
 
 def test_processes_that_start_together_are_all_right(folder):
-    paths = os.pathsep.join([str(folder), *sys.path])
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / "kept"), "PYTHONPATH": paths}
-    command = [sys.executable, "-B", "-c", "from own.main import apply; print(apply(1.5))"]
+    command = [PYTHON, "-B", "-c", "from own.main import apply; print(apply(1.5))"]
     together = [
-        subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+        subprocess.Popen(command, env=environment_of(folder), stdout=subprocess.PIPE, text=True)
         for _ in range(2)
     ]
     assert [process.communicate(timeout=120)[0] for process in together] == ["3.0\n"] * 2
@@ -288,7 +284,7 @@ for name, module in sorted(sys.modules.items()):
 
 def test_another_process_finds_what_is_kept():
     few, more = (
-        printed_by(sys.executable, "-c", STAMPS, *rooms).splitlines()
+        printed_by(PYTHON, "-c", STAMPS, *rooms).splitlines()
         for rooms in (["mechanism", "kinematics"], ["tasks", "analysis", "mechanism", "envs"])
     )
     assert len(few) >= 16

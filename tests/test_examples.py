@@ -2,13 +2,11 @@
 
 import importlib.util
 import json
-import os
 import re
-import subprocess
-import sys
 
 import pytest
 from paths import ROOT
+from processes import PYTHON, printed_by
 
 EXAMPLES = ROOT / "examples"
 PRINTED = {
@@ -18,10 +16,7 @@ PRINTED = {
         None,
         r"Jacobian against differences: \S+e-(0[7-9]|1\d) m/rad\n(y = .*\n){4}83\.4% of",
     ),
-    "own_block_task": (
-        None,
-        r"expert: (9[5-9]\.\d|100\.0)% of 200 episodes, in the wall 0\.0%",
-    ),
+    "own_block_task": (None, r"expert: (9[5-9]\.\d|100\.0)% of 200 episodes, in the wall 0\.0%"),
     "own_machine": (None, r"the expert succeeds in (9\d|100) of 100 episodes"),
     "own_task": (None, r"expert: (9\d\.\d|100\.0)% of 200 episodes"),
     "ppo_analytic": ("4096", r"4,096 steps in \d+ s\nsuccess at the end: [\d.]+% of 500"),
@@ -34,28 +29,18 @@ NEEDS = {"skrl_ppo": "skrl"}
 
 def run(name, folder, *arguments):
     """Run an example in a folder of its own, and return what it prints."""
-    command = [sys.executable, str(EXAMPLES / f"{name}.py"), *arguments]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def require(name):
-    """Skip the test if a package that an example needs is missing."""
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
+    return printed_by(PYTHON, EXAMPLES / f"{name}.py", *arguments, cwd=folder)
 
 
 LONG = "behaviour_cloning"  # plays 40,000 steps of the expert and of the network
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == LONG)) for name in PRINTED],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == LONG)) for name in PRINTED]
 )
 def test_an_example_runs(name, tmp_path):
-    require(name)
     steps, pattern = PRINTED[name]
     printed = run(name, tmp_path, *([] if steps is None else [steps]))
     assert re.search(pattern, printed), printed
@@ -100,6 +85,5 @@ SUCCESS = {"cleanrl_ppo": 90, "ppo_analytic": 90, "sb3_hindsight": 90, "skrl_ppo
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SUCCESS)
 def test_a_whole_run_succeeds(name, tmp_path):
-    require(name)
     last = re.findall(r"success at the end:? ([\d.]+)%", run(name, tmp_path))[-1]
     assert float(last) >= SUCCESS[name]

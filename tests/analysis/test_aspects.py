@@ -34,14 +34,11 @@ def of(aspect: Aspect) -> list[int]:
     return [aspect.assembly.sin_beta, aspect.level3, aspect.assembly.planar, aspect.elevation]
 
 
-def all_centres(cells: Cells) -> FloatArray:
-    return replace(cells, mask=np.ones_like(cells.mask)).centres()
-
-
 @examples(20, oracle.geometries(), oracle.seeds(), modes)
 def test_the_grid_covers_the_reachable_set(g, seed, mode):
     cells = aspects.reachable_set(mode, g, (24, 6, 24))
-    reachable = workspace.reachable(all_centres(cells), mode, g)
+    everywhere = replace(cells, mask=np.ones_like(cells.mask)).centres()
+    reachable = workspace.reachable(everywhere, mode, g)
     np.testing.assert_array_equal(cells.mask.ravel(), reachable)
     np.testing.assert_array_equal(workspace.reachable(cells.centres(), mode, g), True)
     points = oracle.reachable_points(np.random.default_rng(seed), 300, g)

@@ -11,14 +11,7 @@ from gantry import GANTRY
 from paths import ROOT
 from torch.autograd.functional import jacobian as derivatives
 
-from tpm_gym.analysis.decoupling import (
-    LINKS,
-    PLATFORM,
-    link_velocity,
-    motors,
-    over,
-    shares,
-)
+from tpm_gym.analysis.decoupling import LINKS, PLATFORM, link_velocity, motors, over, shares
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, inverse, jacobian
@@ -67,7 +60,8 @@ def test_nowhere_else_is_a_zero_by_structure():
 
 
 def test_motor_3_moves_p_along_the_circle_of_link_7():
-    theta = inverse(np.random.default_rng(1).uniform(*_corners(PAPER_TPM.region), (50, 3)))
+    region = PAPER_TPM.region
+    theta = inverse(np.random.default_rng(1).uniform(region.low, region.high, (50, 3)))
     beta = forward_all(theta).beta[:, 1]
     column = jacobian.velocity(theta)[..., 2]
     tangent = oracle.vector(-np.sin(beta), np.cos(beta), 0.0)
@@ -76,10 +70,6 @@ def test_motor_3_moves_p_along_the_circle_of_link_7():
     rates = (np.linalg.inv(jacobian.velocity(theta)) @ tangent[..., None])[..., 0]
     assert np.abs(rates[:, :2]).max() < 1e-12
     assert np.abs(rates[:, 2]).min() > 0.05
-
-
-def _corners(region: Region) -> tuple[FloatArray, FloatArray]:
-    return np.array(region.low), np.array(region.high)
 
 
 def test_shares_are_parts_of_the_variance():
@@ -107,7 +97,7 @@ def test_motors_counts_motors():
 @pytest.mark.parametrize(("machine", "g"), [(PAPER_TPM, PAPER), (WIDE_TPM, WIDE)])
 def test_the_index_over_a_region_is_the_mean_of_random_points(machine, g):
     found = over(machine.region, geometry=g)
-    points = np.random.default_rng(3).uniform(*_corners(machine.region), (4000, 3))
+    points = np.random.default_rng(3).uniform(machine.region.low, machine.region.high, (4000, 3))
     j = jacobian.velocity(inverse(points, geometry=g), geometry=g)
     np.testing.assert_allclose(found.shares, shares(j).mean(axis=0), atol=0.02)
     np.testing.assert_allclose(found.motors, motors(j).mean(axis=0), atol=0.03)

@@ -192,11 +192,6 @@ def test_the_platform_may_turn_where_the_planes_of_parallelograms_of_balls_share
 # What the page says
 
 
-def table() -> dict[str, list[str]]:
-    rows = re.findall(r"^\| (.+?) \|$", TEXT, flags=re.MULTILINE)
-    return {cells[0]: cells[1:] for cells in (row.split(" | ") for row in rows)}
-
-
 def test_the_page_s_numbers_are_computed():
     theta = inverse([-0.04, 0.028, 0.80])
     found = [analyse_ours(describe(theta))]
@@ -207,7 +202,8 @@ def test_the_page_s_numbers_are_computed():
         q = tripod.inverse_all(points)[:, 0]
         found.append(analyse(tripod.chains(points[0], q[0]), points[0]))
         counts.append(motors(tripod.velocity(points, q)).mean(axis=0))
-    rows = table()
+    lines = re.findall(r"^\| (.+?) \|$", TEXT, flags=re.MULTILINE)
+    rows = {cells[0]: cells[1:] for cells in (line.split(" | ") for line in lines)}
     assert rows["POC set of the platform"] == [str(f.platform) for f in found]
     for label, name in (("equations", "xi of the loops"), ("constraint", "Delta of the loops")):
         printed = [[int(v) for v in cell.split(", ")] for cell in rows[name]]

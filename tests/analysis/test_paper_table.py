@@ -1,4 +1,4 @@
-"""docs/paper.md covers all equations, and all functions, tests and sections that it names exist."""
+"""docs/paper.md covers all equations, and all functions and tests that it names exist."""
 
 import importlib
 import re
@@ -17,11 +17,6 @@ def names_of_tests(file: str) -> set[str]:
     (path,) = (ROOT / "tests").rglob(file)
     source = path.read_text(encoding="utf-8")
     return set(re.findall(r"^def (test_\w+)", source, flags=re.MULTILINE))
-
-
-def anchor(heading: str) -> str:
-    """Return an anchor as GitHub makes it."""
-    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def test_every_equation_has_its_row():
@@ -44,10 +39,3 @@ def test_named_functions_exist(path):
     module, *names = path.split(".")
     room = {"poc": "analysis.", "topology": "analysis.", "jacobian": "kinematics."}.get(module, "")
     assert callable(reduce(getattr, names, importlib.import_module(f"tpm_gym.{room}{module}")))
-
-
-def test_links_lead_to_sections():
-    sections = {anchor(h) for h in re.findall(r"^#+ (.+)$", TEXT, flags=re.MULTILINE)}
-    links = set(re.findall(r"\]\(#([^)]+)\)", TEXT))
-    assert links
-    assert links <= sections

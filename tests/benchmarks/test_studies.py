@@ -26,13 +26,7 @@ from studies.bisection import ends, halving, nominal
 from studies.figures import learning_curves, penalty
 from studies.page import BENCHMARK, ENGINES, PAGE, RUNS, Write, every_run, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
-from studies.records import (
-    RECORDS,
-    Collect,
-    collect,
-    condense,
-    read_records,
-)
+from studies.records import RECORDS, Collect, collect, condense, read_records
 from studies.reliability import interquartile_mean, profile
 from studies.running import execute, run_all
 from trainings import PPO_RECIPE
@@ -349,10 +343,7 @@ def test_the_page_is_what_its_records_say():
     ("other", "labels"),
     [
         ({"steps": 999}, ["SAC + HER, 120 steps", "SAC + HER, 999 steps"]),
-        (
-            {"engine": "mujoco"},
-            ["SAC + HER, PyBullet", "SAC + HER, mujoco"],
-        ),
+        ({"engine": "mujoco"}, ["SAC + HER, PyBullet", "SAC + HER, mujoco"]),
         ({"recipe": DEMONSTRATED}, ["SAC + HER", "SAC + HER, demonstrations"]),
     ],
 )

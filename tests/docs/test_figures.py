@@ -38,16 +38,11 @@ X, Z = np.linspace(-0.92, 1.06, 100), np.linspace(-1.18, 1.22, 121)
 OTHER = Geometry(l1=0.25, l2=0.06, l3=0.30, l4=0.65, l5=0.08, l6=0.02, l7=0.12)
 
 
-def random_points(count: int, geometry: Geometry = PAPER) -> np.ndarray:
-    rng = np.random.default_rng(0)
-    reach = geometry.l3 + geometry.l4
-    return rng.uniform((-reach, -geometry.l7, -reach), (reach, geometry.l7, reach), (count, 3))
-
-
 @pytest.mark.parametrize("geometry", [PAPER, OTHER])
 @pytest.mark.parametrize("mode", [ELBOWS_OUT, WORKING_MODES[3]])
 def test_serial_squares_are_the_squares_of_the_factors_and_tell_what_is_reached(geometry, mode):
-    points = random_points(20_000, geometry)
+    high = np.array([geometry.l3 + geometry.l4, geometry.l7, geometry.l3 + geometry.l4])
+    points = np.random.default_rng(0).uniform(-high, high, (20_000, 3))
     squares = serial_squares(points, mode.cos_beta, geometry)
     valid = reachable(points, mode, geometry)
     assert 0.2 < valid.mean() < 0.9

@@ -67,13 +67,10 @@ def test_the_least_within_limits_is_found_from_inside_and_only_from_there():
 # -- lengths ---------------------------------------------------------------------------------------
 
 
-def vector(design: lengths.Design) -> torch.Tensor:
-    return torch.tensor([*vars(design.geometry).values(), *design.box.low, *design.box.high])
-
-
 @each_design
 def test_gradients_by_lengths_and_box_are_those_of_differences(design):
-    at = vector(design).double().requires_grad_()
+    numbers = [*vars(design.geometry).values(), *design.box.low, *design.box.high]
+    at = torch.tensor(numbers).double().requires_grad_()
     assert torch.autograd.gradcheck(lengths.room, (at,), rtol=1e-6, fast_mode=True)
 
 

@@ -26,19 +26,20 @@ EVIDENCE = {
     "docs/loops-sweep.md",  # a table
     "docs/results-runs.md",  # tables
 }
-FILLED = {
-    "README.md": ["numbers", "policies"],
-    "docs/fidelity.md": ["summary", "long"],
-    "docs/analytic-engine.md": ["limits"],
-    "docs/speed.md": ["speed", "analytic"],
-    "docs/engines.md": ["engines"],
-    "docs/transfer.md": ["transfer"],
-    "docs/shield.md": ["shield"],
-    "docs/cycle.md": ["cycle"],
-    "docs/crossing.md": ["crossing"],
-    "docs/conveyor.md": ["conveyor"],
-    "docs/datasets.md": ["cloning"],
-}
+FILLED = [
+    ("README.md", "numbers", "readme_numbers"),
+    ("README.md", "policies", "readme_numbers"),
+    ("docs/fidelity.md", "summary", "fidelity_long"),
+    ("docs/fidelity.md", "long", "fidelity_long"),
+    ("docs/analytic-engine.md", "limits", "engine_limits"),
+    ("docs/speed.md", "speed", "readme_numbers"),
+    ("docs/speed.md", "analytic", "analytic_report"),
+    ("docs/engines.md", "engines", "engine_report"),
+    ("docs/datasets.md", "cloning", "bench_cloning"),
+    *((f"docs/{name}.md", name, f"bench_{name}")
+      for name in ("transfer", "shield", "cycle", "crossing", "conveyor")),
+]  # fmt: skip
+"""Page, marks around its numbers, and the module that writes them."""
 RUN = [page for page in PAGES if blocks(page, "python") and page.name != "extending.md"]
 TYPED = [page for page in PAGES if blocks(page, "bash")]
 
@@ -125,35 +126,20 @@ def test_every_id_on_a_page_exists(page):
 
 
 @pytest.mark.usefixtures("needs_pybullet")
-@pytest.mark.parametrize(("page", "name"), [(p, n) for p, names in FILLED.items() for n in names])
-def test_the_numbers_of_a_page_are_those_of_its_record(page, name):
+@pytest.mark.parametrize(("page", "name", "module"), FILLED)
+def test_the_numbers_of_a_page_are_those_of_its_record(page, name, module):
     begin, end = (f"<!-- {name}: {part} -->" for part in ("begin", "end"))
     found = read(ROOT / page).split(begin)[1].split(end)[0].strip().splitlines()
-    assert found == "\n".join(expected(name)).strip().splitlines()
+    assert found == "\n".join(expected(name, importlib.import_module(module))).strip().splitlines()
 
 
-def expected(name):
+def expected(name, module):
     """Return the lines that a benchmark writes between the marks of that name."""
-    module = {
-        "analytic": "analytic_report",
-        "engines": "engine_report",
-        "limits": "engine_limits",
-        "long": "fidelity_long",
-        "summary": "fidelity_long",
-        "transfer": "bench_transfer",
-        "shield": "bench_shield",
-        "cycle": "bench_cycle",
-        "crossing": "bench_crossing",
-        "conveyor": "bench_conveyor",
-        "cloning": "bench_cloning",
-    }.get(name)
-    if module is None:
-        numbers = importlib.import_module("readme_numbers")
-        record = numbers.read_record(numbers.RECORDS / "speed.json")
-        return numbers.speed(record) if name == "speed" else getattr(numbers, name)()
-    report = importlib.import_module(module)
-    write = report.summary if name == "summary" else report.lines
-    return write(json.loads(report.RECORD.read_text()) if report.RECORD.exists() else {})
+    if module.__name__ == "readme_numbers":
+        record = module.read_record(module.RECORDS / "speed.json")
+        return module.speed(record) if name == "speed" else getattr(module, name)()
+    write = module.summary if name == "summary" else module.lines
+    return write(json.loads(module.RECORD.read_text()) if module.RECORD.exists() else {})
 
 
 def test_every_page_is_in_a_table_of_contents():

@@ -24,6 +24,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("TPMPickAndPlace-v0", {"engine": "mujoco", "randomisation": EVERYTHING}),
     ("TPMPickAndPlaceJointsDense-v0", {"engine": "mujoco", "machine": "wide", "drive": "servo"}),
     ("TPMPickAndPlace-v0", {"engine": "mujoco", "machine": "gantry"}),
+    ("TPMConveyorDense-v0", {"engine": "mujoco"}),
+    ("TPMPickAndPlaceDense-v0", {"engine": "analytic", "machine": "delta"}),
     ("TPMReachJointsDense-v0", {"engine": "analytic"}),
     ("TPMPickAndPlace-v0", {"engine": "analytic", "randomisation": EVERYTHING}),
     ("TPMPickAndPlaceJoints-v0", {"engine": "analytic", "machine": "wide"}),
@@ -98,8 +100,7 @@ class Eager(Reach):
 
 
 @pytest.mark.parametrize(
-    ("task", "promise"),
-    [(Unseeded, "the checkers of Gymnasium"), (Eager, "the goal's term is 0")],
+    ("task", "promise"), [(Unseeded, "the checkers of Gymnasium"), (Eager, "the goal's term is 0")]
 )
 def test_what_does_not_keep_it_is_found(task, promise):
     with pytest.raises(ConformanceError, match=promise) as caught:

@@ -92,8 +92,7 @@ def touching(env: gym.Env[Any, Any]) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("env_id", "randomisation"),
-    [("TPMThrow-v0", EVERYTHING), ("TPMThrowJointsDense-v0", {})],
+    ("env_id", "randomisation"), [("TPMThrow-v0", EVERYTHING), ("TPMThrowJointsDense-v0", {})]
 )
 def test_saved_states_go_on_equally_on_their_way_in_contact_and_holding(env_id, randomisation):
     env = make(env_id, randomisation=randomisation, max_episode_steps=1000)

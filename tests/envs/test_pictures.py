@@ -212,9 +212,12 @@ def test_a_tile_is_one_picture_of_the_first_environments(engine):
         ({"camera": {"target": (0, 0, 0), "distance": 0.0}}, "distance = 0.0 .*0.05 to 7.0"),
         ({"camera": {"target": (0, 0, 0), "distance": 1, "pitch": 91}}, "pitch"),
         ({"camera": {"target": (0, 0, 0), "distance": 1, "roll": 0}}, "camera = .*keys among"),
-        ({"width": 8}, "width = 8"),
-        ({"height": 5000}, "height = 5000"),
+        *(({"width": value}, f"width = {value!r}") for value in (8, 15, 5000, 64.0, "64")),
+        ({"height": 2.5}, "height = 2.5"),
         ({"render_mode": "depth"}, "render_mode = 'depth' .*'depth_array', 'rgbd_tuple'"),
+        ({"observations": "images"}, "observations = 'images' .*'state' or 'pixels'"),
+        ({"observations": "pixels", "pixel_size": 8}, "pixel_size = 8 .*16 to 1024"),
+        ({"observations": "pixels", "pixel_size": 84.0}, "pixel_size"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(options, message):

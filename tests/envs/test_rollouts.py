@@ -4,7 +4,6 @@ Their records are made by ``python tests/support/rollouts.py tests/data/rollouts
 """
 
 import json
-from typing import Any
 
 import pytest
 from paths import ROOT
@@ -21,11 +20,10 @@ def test_every_case_is_recorded_and_no_other():
     assert set(cases()) >= FAST
 
 
-def marked(case: tuple[str, str]) -> Any:
-    return pytest.param(*case, marks=[] if case in FAST else [pytest.mark.slow])
-
-
-@pytest.mark.parametrize(("env_id", "name"), [marked(case) for case in cases()])
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [pytest.param(*case, marks=[pytest.mark.slow] * (case not in FAST)) for case in cases()],
+)
 def test_rollouts_are_those_on_record(env_id, name):
     found, recorded = play(env_id, name, Expert), RECORDED[f"{env_id} {name}"]
     # A policy computes in single precision, and its block may be about to slip or to tip.

@@ -230,11 +230,7 @@ BAD: list[tuple[Callable[[TPMVectorEnv], Any], type[Exception], str]] = [
     (lambda envs: envs.step(np.zeros((5, 3))), ActionError, r"\(5, 4\)"),
     (lambda envs: envs.step(np.full((5, 4), np.nan)), ActionError, "finite"),
     *(
-        (
-            lambda envs, seed=seed: envs.reset(seed=seed),
-            InputError,
-            "0 or more, or 5",
-        )
+        (lambda envs, seed=seed: envs.reset(seed=seed), InputError, "0 or more, or 5")
         for seed in ([1, 2], 1.5, "1", -1, [1, 2, 3, 4, -4], "12345", [True] * 5)
     ),
     (lambda envs: envs.reset(options=[1]), ResetOptionError, "a dictionary"),

@@ -30,8 +30,7 @@ NO_LENGTHS = [-0.1, np.nan, np.inf, -np.inf, True, False, "0.3", None, [0.3], 10
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [*product(LENGTHS, NO_LENGTHS), *product(LENGTHS[:5] + LENGTHS[6:], [0.0])],
+    ("name", "value"), [*product(LENGTHS, NO_LENGTHS), *product(LENGTHS[:5] + LENGTHS[6:], [0.0])]
 )
 def test_values_that_are_no_length_are_refused_by_name(name, value):
     with pytest.raises(GeometryError) as caught:

@@ -10,14 +10,7 @@ from torch.autograd.functional import jacobian as derivatives
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import SingularityError
-from tpm_gym.kinematics import (
-    ASSEMBLY_MODES,
-    ELBOWS_OUT,
-    AssemblyMode,
-    forward,
-    inverse,
-    jacobian,
-)
+from tpm_gym.kinematics import ASSEMBLY_MODES, ELBOWS_OUT, AssemblyMode, forward, inverse, jacobian
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import PAPER_TPM
 
@@ -99,12 +92,3 @@ def test_velocity_is_finite_at_the_edge_of_the_workspace_in_y(sign):
     beside = jacobian.velocity(inverse(inside, ELBOWS_OUT), branch)
     np.testing.assert_allclose(j, beside, atol=2e-3)
     assert_derivative(theta, branch, PAPER)
-
-
-def test_evaluate_equals_the_separate_functions():
-    for branch in ASSEMBLY_MODES:
-        theta = oracle.angles_on(branch, np.random.default_rng(6), 200, PAPER, clear=1e-2)
-        found = jacobian.evaluate(theta, branch)
-        np.testing.assert_array_equal(found.position, forward(theta, branch))
-        np.testing.assert_array_equal(found.velocity, jacobian.velocity(theta, branch))
-        np.testing.assert_array_equal(found.conditioning, jacobian.conditioning(theta, branch))

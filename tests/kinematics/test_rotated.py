@@ -70,8 +70,15 @@ def ours(theta: FloatArray, g: Geometry) -> list[FloatArray]:
     return [some[real] for some, real in zip(rows, valid, strict=True)]
 
 
-def check(count: int, g: Geometry, seed: int) -> None:
-    given, other, compared, worst = angles(np.random.default_rng(seed), count), 0, 0, 0.0
+FEW = [(300, g) for g in (PAPER, WIDE, random_geometry(0), random_geometry(1))]
+MANY = [(10_000, g) for g in (PAPER, WIDE, *map(random_geometry, range(20)))]
+
+
+@pytest.mark.parametrize(
+    ("count", "g"), [*FEW, *(pytest.param(*case, marks=pytest.mark.slow) for case in MANY)]
+)
+def test_no_assembly_of_either_mode_is_missed_or_invented(count, g):
+    given, other, compared, worst = angles(np.random.default_rng(1), count), 0, 0, 0.0
     for some in np.split(given, range(500, count, 500)):
         result = unmatched(assemblies(some, g), ours(some, g))
         other, compared, worst = other + result[0], compared + result[1], max(worst, result[2])
@@ -79,17 +86,6 @@ def check(count: int, g: Geometry, seed: int) -> None:
     assert other == 0
     assert worst < 1e-6
     assert compared > 0.1 * count
-
-
-@pytest.mark.parametrize("g", [PAPER, WIDE, random_geometry(0), random_geometry(1)])
-def test_no_assembly_of_either_mode_is_missed_or_invented(g):
-    check(300, g, seed=1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("g", [PAPER, WIDE, *map(random_geometry, range(20))])
-def test_no_assembly_of_either_mode_is_missed_or_invented_at_10000_angles(g):
-    check(10_000, g, seed=2)
 
 
 def test_the_assembly_of_an_independent_check():

@@ -61,10 +61,6 @@ def assert_zero(expression: Any) -> None:
     assert sp.simplify(sp.expand(expression)) == 0
 
 
-def product(factors: list[Any]) -> Any:
-    return sp.prod(factors)
-
-
 def test_eq_7_is_the_difference_of_the_two_lines_of_eq_6():
     a1, b1 = 2 * (B[1][0] + 2 * l5), 2 * (B[1][2] - B[0][2])
     c1 = (B[1][0] + 2 * l5) ** 2 + B[1][2] ** 2 - B[0][1] ** 2 - B[0][2] ** 2
@@ -114,33 +110,7 @@ def test_eqs_13_and_15_corrected_are_the_closures_in_the_half_angle(leg):
 
 def test_eq_16_factors_are_the_determinant_of_the_closures():
     parallel = sp.Matrix(CLOSURES).jacobian([x_c, z_c, beta])
-    assert_zero(parallel.det() - 8 * l7 * product(PARALLEL))
-
-
-def turned_closures(phi: Any) -> list[Any]:
-    """Of both rods 4, of rod 6 and of branch III, where link 3' is turned by phi about y."""
-    along, up = column(sp.cos(phi), 0, -sp.sin(phi)), column(sp.sin(phi), 0, sp.cos(phi))
-    e1 = C1 + l6 * up + l7 * (sp.cos(beta) * along + sp.sin(beta) * column(0, 1, 0))
-    level = l5 * column(1, 0, 0)
-    rods = [
-        (C1 + l5 * along) - (B[0] + level),
-        (C1 - l5 * along) - (B[0] - level),
-        (C1 - 2 * l5 * along) - B[1],
-        (e1 + 2 * l2 * along) - B[2],  # C3 = E1 + (E1F1 - C3D3) + F1D3
-    ]
-    return [rod.dot(rod) - l4**2 for rod in rods]
-
-
-def test_the_complete_determinant_has_the_constraint_as_a_fourth_factor():
-    """Eq. (16) takes for granted that link 3' translates; let it turn, and z_C1 - z_B1 appears."""
-    phi = sp.Symbol("phi", real=True)
-    closures = turned_closures(phi)
-    difference = closures[0] - closures[1]
-    turn = {sp.cos(phi): (1 - half**2) / (1 + half**2), sp.sin(phi): 2 * half / (1 + half**2)}
-    expected = -8 * half * l5 * (half * x_c + CONSTRAINT) / (1 + half**2)
-    assert_zero(difference.subs(turn) - expected)
-    complete = sp.Matrix(closures).jacobian([x_c, z_c, phi, beta]).subs(phi, 0)
-    assert_zero(complete.det() + 32 * l5 * CONSTRAINT * l7 * product(PARALLEL))
+    assert_zero(parallel.det() - 8 * l7 * sp.prod(PARALLEL))
 
 
 def test_eq_17_factors_are_the_derivatives_by_the_motors():
@@ -153,9 +123,7 @@ def test_eq_17_factors_are_the_derivatives_by_the_motors():
 def test_determinants_of_a_and_b_are_products_of_the_factors():
     """A and B in the velocity of P: rows 1 and 2 times cos(beta), with y = l7 sin(beta)."""
     cos, sin = sp.cos(beta), sp.sin(beta)
-    a = sp.Matrix(
-        [[cos * r[0], sin * r[0], cos * r[2]] for r in RODS[:2]] + [list(RODS[2])],
-    )
+    a = sp.Matrix([[cos * r[0], sin * r[0], cos * r[2]] for r in RODS[:2]] + [list(RODS[2])])
     b = sp.diag(cos * SERIAL[1], cos * SERIAL[2], SERIAL[3])
     # Each row is what its closure says about the velocities of P and of the motors.
     p_rates = P.jacobian([x_c, z_c, beta])
@@ -163,8 +131,8 @@ def test_determinants_of_a_and_b_are_products_of_the_factors():
         by_links = sp.Matrix([CLOSURES[leg]]).jacobian([x_c, z_c, beta]) / 2
         assert sp.simplify((a[leg, :] * p_rates - scale * by_links).expand()) == sp.zeros(1, 3)
         assert_zero(b[leg, leg] + scale * sp.diff(CLOSURES[leg], THETA[leg]) / 2)
-    assert_zero(a.det() + cos * product(PARALLEL))
-    assert_zero(b.det() - cos * product(SERIAL))
+    assert_zero(a.det() + cos * sp.prod(PARALLEL))
+    assert_zero(b.det() - cos * sp.prod(SERIAL))
 
 
 SYMBOLIC = {

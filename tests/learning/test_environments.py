@@ -75,10 +75,7 @@ def test_no_file_decides_what_is_imported(tmp_path, run, capsys):
     stored = json.loads((tmp_path / "a run" / "config.json").read_text())
     stored["env"] = content["env"]
     (tmp_path / "a run" / "config.json").write_text(json.dumps(stored))
-    commands = [
-        ["evaluate", "--episodes", "1", "--policy", "best.json"],
-        ["resume", "a run"],
-    ]
+    commands = [["evaluate", "--episodes", "1", "--policy", "best.json"], ["resume", "a run"]]
     for words in commands:
         with pytest.raises(SystemExit, match=r"'my_tasks'.*give --env my_tasks:TPMReach-v0"):
             run(*words)
@@ -110,10 +107,7 @@ def test_a_stopped_run_says_how_its_module_is_found_again(tmp_path, run, monkeyp
 @pytest.mark.parametrize(
     ("env_id", "message"),
     [
-        (
-            "TPMRech-v0",
-            "unknown environment 'TPMRech-v0'; .*TPMPickAndPlace-v0.*module:id",
-        ),
+        ("TPMRech-v0", "unknown environment 'TPMRech-v0'; .*TPMPickAndPlace-v0.*module:id"),
         ("no_such_module:TPMMine-v0", "cannot import 'no_such_module'.*folder that holds it"),
         (".x:TPMReach-v0", "cannot import .*TypeError"),
         ("CartPole-v1", "CartPole-v1 is no environment of tpm_gym"),

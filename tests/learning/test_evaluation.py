@@ -200,11 +200,7 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     monkeypatch.setattr(sys, "argv", ["tpm-gym", "evaluate", *words])
     main()
     content = read_strict(path)
-    assert content["randomisation"] == {
-        "encoder_noise": 1e-4,
-        "friction": [0.5, 1.0],
-        "latency": 1,
-    }
+    assert content["randomisation"] == {"encoder_noise": 1e-4, "friction": [0.5, 1.0], "latency": 1}
     assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
     assert content["env_options"] == {**nominal, "drive": "servo"}
     assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]

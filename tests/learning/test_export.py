@@ -190,10 +190,7 @@ def counted() -> Blank:
         (lambda: make(DDPG, Blank()), "DDPG is none of sac, tqc, ppo"),
         (lambda: make(SAC, endless()), "inf.* bounded"),
         (lambda: make(SAC, counted()), "bounded Box of floats"),
-        (
-            lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))),
-            "VecNormalize",
-        ),
+        (lambda: PPO("MultiInputPolicy", VecNormalize(DummyVecEnv([Blank]))), "VecNormalize"),
     ],
 )
 def test_what_the_files_cannot_hold_is_refused(tmp_path, build, message):

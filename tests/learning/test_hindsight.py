@@ -59,11 +59,7 @@ def draw(model: SAC, seed: int = 0, env: VecNormalize | None = None) -> DictRepl
 
 @pytest.mark.parametrize(
     ("n_envs", "strategy", "env_id"),
-    [
-        (1, "future", "TPMReach-v0"),
-        (3, "final", "TPMReach-v0"),
-        (3, "episode", "TPMReachDense-v0"),
-    ],
+    [(1, "future", "TPMReach-v0"), (3, "final", "TPMReach-v0"), (3, "episode", "TPMReachDense-v0")],
 )
 def test_same_samples_and_rewards_as_the_environment_pays_by_copied_infos(n_envs, strategy, env_id):
     def sampled(buffer, **options):

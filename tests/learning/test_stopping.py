@@ -23,15 +23,7 @@ from trainings import (
 )
 
 import tpm_gym
-from tpm_gym.learning import (
-    ResumeConfig,
-    callbacks,
-    curve,
-    export,
-    resume,
-    train,
-    training,
-)
+from tpm_gym.learning import ResumeConfig, callbacks, curve, export, resume, train, training
 from tpm_gym.learning.callbacks import Checkpointing
 from tpm_gym.learning.checkpoint import CheckpointStore
 from tpm_gym.learning.errors import ConfigError, RunError
@@ -46,11 +38,7 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 
 @pytest.mark.parametrize(
     ("case", "step", "number"),
-    [
-        ("sac", 1, signal.SIGINT),
-        ("sac", 187, signal.SIGTERM),
-        ("ppo", 95, signal.SIGINT),
-    ],
+    [("sac", 1, signal.SIGINT), ("sac", 187, signal.SIGTERM), ("ppo", 95, signal.SIGINT)],
 )
 def test_a_stopped_run_saves_and_goes_on(case, step, number, tmp_path, monkeypatch):
     config = replace(make_config(case, tmp_path), checkpoint_every=10_000)

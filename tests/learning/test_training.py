@@ -18,15 +18,7 @@ import torch
 from paths import ROOT
 from processes import PYTHON, signalled
 from stable_baselines3 import SAC
-from trainings import (
-    CASES,
-    evaluations,
-    make_config,
-    quiet,
-    said,
-    table,
-    uninterrupted,
-)
+from trainings import CASES, evaluations, make_config, quiet, said, table, uninterrupted
 
 import tpm_gym
 from tpm_gym.errors import TPMError
@@ -77,13 +69,6 @@ def test_same_seed_same_policy_whatever_is_evaluated(run, tmp_path):
     assert equal(parameters(run), parameters(config.run))
     train(replace(config, run=tmp_path / "other", seed=1, steps=60), quiet())
     assert not equal(parameters(run), parameters(tmp_path / "other"))
-
-
-def test_a_learning_rate_falls_to_zero_if_asked_to(run):
-    rates = [float(row["train/learning_rate"]) for row in table(run) if row["train/learning_rate"]]
-    assert 0.0001 < rates[0] < 0.0002  # about half way
-    assert rates == sorted(rates, reverse=True)
-    assert 0 <= rates[-1] <= 0.0003 * 2 / 300  # an update takes two steps
 
 
 def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_path):
@@ -224,10 +209,7 @@ def test_both_policies_are_exported_and_nothing_is_unpickled_for_it(run):
 @pytest.mark.usefixtures("needs_pybullet")
 @pytest.mark.parametrize(
     ("number", "status"),
-    [
-        (signal.SIGINT, 130),
-        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
-    ],
+    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
 )
 def test_command_line_trains_ppo_in_parallel_and_stops_when_asked_to(tmp_path, number, status):
     """Signal the whole process group, workers included, as a terminal or a batch system does."""

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from examples import examples
 from hypothesis import strategies as st
-from walk import turn
+from walk import turned
 
-from tpm_gym.arrays import FloatArray, Vector
+from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.bodies import LEVEL, Link, Solid
 
 AXES = ("x", "y", "z")
@@ -50,14 +50,6 @@ def cloud(solid: Solid) -> tuple[FloatArray, FloatArray]:
     at[:, along] = h_
     at[:, (along + 1) % 3], at[:, (along + 2) % 3] = r_ * np.cos(turn_), r_ * np.sin(turn_)
     return at @ turned(solid.rpy).T + solid.centre, mass.ravel()
-
-
-def turned(rpy: Vector) -> FloatArray:
-    """Turn about x, then y, then z, all fixed."""
-    about_x, about_y, about_z = (
-        turn(tuple(axis), a) for axis, a in zip(np.eye(3), rpy, strict=True)
-    )
-    return about_z @ about_y @ about_x
 
 
 def moments(at: FloatArray, mass: FloatArray, about: FloatArray) -> FloatArray:

@@ -1,12 +1,17 @@
-"""The Delta against root finders, differences, published numbers, its bodies and Pinocchio."""
+"""The Delta against root finders, differences, published numbers and its bodies.
+
+Pinocchio computes its torques in test_pinocchio.py.
+"""
 
 import importlib
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 import pytest
 from mutated import functions_of, install
+from roots import circle_roots, unit, unmatched
 from walk import gaps, place, walk
 
 from tpm_gym.errors import ConfigurationError, GeometryError, SingularityError, UnreachableError
@@ -15,13 +20,10 @@ from tpm_gym.mechanism.closures import closure_jacobian, moving_joints
 from tpm_gym.mechanism.delta import kinematics
 from tpm_gym.mechanism.delta.geometry import ASSEMBLY_MODES, IRB_360, WORKING_MODES, DeltaGeometry
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.mechanism.urdf import loops_text, urdf_text
 
 TURNS = 2 * np.pi / 3 * np.arange(3)
 OUT = np.stack([np.cos(TURNS), np.sin(TURNS), np.zeros(3)], axis=-1)
 UP = np.array([0.0, 0.0, 1.0])
-GRID = np.linspace(0, 2 * np.pi, 721)
-MARGIN = 1e-3  # of l4; a grid does not separate two roots that nearly coincide
 
 
 @cache
@@ -60,84 +62,69 @@ def of_mode(g, theta, points):
 # Positions
 
 
-@pytest.mark.parametrize("index", range(20))
-def test_forward_misses_and_invents_no_solution(index):
+def forward_by_roots(g, theta):
     """P goes around the circle in which two spheres intersect; the third cuts it at the roots."""
-    g = geometries()[index]
-    theta = np.random.default_rng(index).uniform(-np.pi, np.pi, (500, 3))
     a, b, c = np.moveaxis(pivots(g, theta), -2, 0)
     middle, way = (a + b) / 2, b - a
     across = np.linalg.norm(way, axis=-1, keepdims=True)
-    radius2 = g.l4**2 - across[:, 0] ** 2 / 4
+    rows = np.flatnonzero(across[:, 0] < 2 * g.l4)
     one = np.cross(way, np.roll(way, 1, axis=-1))
     one /= np.linalg.norm(one, axis=-1, keepdims=True)
     other = np.cross(way / across, one)
-    radius = np.sqrt(np.maximum(radius2, 0.0))[:, None]
 
-    def at(turn):
-        turn = turn[..., None]
-        around = np.cos(turn) * one[:, None] + np.sin(turn) * other[:, None]
-        return middle[:, None] + radius[..., None] * around
+    def at(row, turn):
+        row, turn = rows[row], turn[..., None]
+        radius = np.sqrt(g.l4**2 - across[row] ** 2 / 4)
+        return middle[row] + radius * (np.cos(turn) * one[row] + np.sin(turn) * other[row])
 
-    def miss(turn):
-        return ((at(turn) - c[:, None]) ** 2).sum(axis=-1) - g.l4**2
+    def miss(row, turn):
+        return ((at(row, turn) - c[rows[row]]) ** 2).sum(axis=-1) - g.l4**2
 
-    inside = miss(np.broadcast_to(GRID, (500, len(GRID)))) < 0
-    crossed = inside[:, 1:] != inside[:, :-1]
-    real = (crossed.sum(axis=-1) == 2) & (radius2 > 0)
+    row, turn = circle_roots(miss, len(rows))
+    points = at(row, turn)
+    return [points[rows[row] == k] for k in range(len(theta))]
+
+
+def inverse_by_roots(g, points):
+    """The elbow goes around its circle; the distance to C is l4 at the roots."""
+
+    def miss(leg):
+        def apart(row, turn):
+            pivot = pivots(g, np.broadcast_to(turn[..., None], (*turn.shape, 3)))[..., leg, :]
+            return np.linalg.norm(points[row] - pivot, axis=-1) - g.l4
+
+        return apart
+
+    legs = [circle_roots(miss(leg), len(points)) for leg in range(3)]
+    found = [product(*(turn[row == k] for row, turn in legs)) for k in range(len(points))]
+    return [np.array(list(angles)).reshape(-1, 3) for angles in found]
+
+
+@pytest.mark.parametrize("index", range(20))
+def test_forward_misses_and_invents_no_solution(index):
+    g = geometries()[index]
+    theta = np.random.default_rng(index).uniform(-np.pi, np.pi, (500, 3))
     found = kinematics.forward_all(theta, g)
-    for point in (found[:, 0], found[:, 1]):
-        gap = np.linalg.norm(point[:, None] - pivots(g, theta), axis=-1) - g.l4
-        assert np.nanmax(np.abs(gap)) < 1e-7 * g.l4
-    ours = np.isfinite(found).all(axis=(-2, -1))
-    depth = np.linalg.norm(found[:, 0] - found[:, 1], axis=-1)
-    clear = real == ours
-    assert (depth[~clear & ours] < 0.05 * g.l4).all()  # between two lines of the grid
-    assert (~clear).sum() < 10
-    assert not (real & ~ours).any()
-    rows = np.flatnonzero(real & ours)
-    starts = np.array([np.flatnonzero(crossed[row]) for row in rows])
-    low, high = (np.zeros((500, 2)) for _ in range(2))
-    low[rows], high[rows] = GRID[starts], GRID[starts + 1]
-    rising = miss(low) < 0
-    for _ in range(60):
-        half = (low + high) / 2
-        same = (miss(half) < 0) == rising
-        low, high = np.where(same, half, low), np.where(same, high, half)
-    roots = at(low)[rows]
-    apart = np.linalg.norm(roots[:, :, None] - found[rows][:, None], axis=-1)
-    nearest = apart.min(axis=2)[depth[rows] > MARGIN * g.l4]
-    assert nearest.max() < 1e-6
-    assert len(nearest) > 50
+    gap = np.linalg.norm(found[..., None, :] - pivots(g, theta)[:, None], axis=-1) - g.l4
+    assert np.nanmax(np.abs(gap)) < 1e-7 * g.l4
+    ours = [both[np.isfinite(both).all(axis=-1)] for both in found]
+    other, compared, worst = unmatched(forward_by_roots(g, theta), ours)
+    assert (other, worst < 1e-6) == (0, True)
+    assert compared > 100
 
 
 @pytest.mark.parametrize("index", range(20))
 def test_inverse_misses_and_invents_no_solution(index):
-    """The elbow goes around its circle; the distance to C passes l4 at the roots."""
     g = geometries()[index]
     points = sampled(g, 500, index)
     found = kinematics.inverse_all(points, g)
-    theta = np.broadcast_to(GRID[:, None] - np.pi, (721, 3))
-    apart = np.linalg.norm(points[:, None, None] - pivots(g, theta), axis=-1)  # (500, 721, 3)
-    inside = apart < g.l4
-    crossed = inside[:, 1:] != inside[:, :-1]
-    count = crossed.sum(axis=1)
-    real = (count == 2).all(axis=-1)
-    assert not (real & ~np.isfinite(found).all(axis=(1, 2))).any()
-    unsure = (np.abs(apart - g.l4).min(axis=1) < 0.01 * g.l4).any(axis=-1)
-    ours = np.isfinite(found).all(axis=(1, 2))
-    assert (real == ours)[~unsure | real].all()
-    assert np.isnan(found[~ours]).all()
     gap = np.linalg.norm(points[:, None, None] - pivots(g, found), axis=-1) - g.l4
     assert np.nanmax(np.abs(gap)) < 1e-9
-    for row in np.flatnonzero(real):
-        for leg in range(3):
-            roots = GRID[np.flatnonzero(crossed[row, :, leg])] - np.pi
-            near = [np.abs(np.exp(1j * found[row, :, leg]) - np.exp(1j * root)) for root in roots]
-            assert (np.min(near, axis=1) < 0.02).all()
-            signs = np.sign([mode[leg] for mode in WORKING_MODES])
-            assert np.ptp(found[row, signs > 0, leg]) == np.ptp(found[row, signs < 0, leg]) == 0
-    assert real.sum() > 20
+    ours = [unit(angles[np.isfinite(angles).all(axis=-1)]) for angles in found]
+    roots = [unit(angles) for angles in inverse_by_roots(g, points)]
+    other, compared, worst = unmatched(roots, ours)
+    assert (other, worst < 1e-6) == (0, True)
+    assert compared > 160
 
 
 def test_working_modes_are_the_signs_of_the_serial_factors():
@@ -178,8 +165,8 @@ def test_jacobian_is_the_derivative_of_the_position():
             angles = theta[of_mode(g, theta, points[:, None])[:, slot] == (side > 0), slot]
             found = kinematics.jacobian(angles, side, g)
             index = ASSEMBLY_MODES.index(side)
-            for motor, unit in enumerate(np.eye(3)):
-                ends = (kinematics.forward_all(angles + s * step * unit, g) for s in (1, -1))
+            for motor, by in enumerate(step * np.eye(3)):
+                ends = (kinematics.forward_all(angles + s * by, g) for s in (1, -1))
                 slope = np.subtract(*ends)[:, index] / (2 * step)
                 size = 1 + np.abs(found).max(axis=(1, 2))[:, None] ** 3
                 assert (np.abs(found[..., motor] - slope) / size).max() < 1e-6
@@ -381,61 +368,6 @@ def test_compiled_dynamics_are_the_equations():
     bias = DELTA.dynamics.torque(theta, rates, np.zeros(3))
     np.testing.assert_allclose(motion.bias, bias, rtol=1e-9)
     assert motion.working.all()
-
-
-def test_pinocchio_agrees_on_closures_masses_and_torques(tmp_path):
-    """Measured: closures 1e-9 m, masses and torques 1e-7 of the largest: the digits of the URDF."""
-    pin = pytest.importorskip("pinocchio", reason="Pinocchio has no wheels for Windows")
-    yaml = pytest.importorskip("yaml")
-    mechanism = DELTA.mechanism
-    model = pin.buildModelFromXML(urdf_text(mechanism, closure_frames=True))
-    loops = yaml.safe_load(loops_text(mechanism))
-    model.gravity.linear = np.array(DELTA.mount.free_fall)
-    data = model.createData()
-    joints = list(model.names[1:])
-    columns = [int(model.joints[model.getJointId(name)].idx_v) for name in joints]
-    at = dict(zip(joints, columns, strict=True))
-    driven = [at[name] for name in loops["name_mot"]]
-    passive_joints = [c for name, c in at.items() if name not in (*loops["name_mot"], "cup_slide")]
-    pairs = [[model.getFrameId(name) for name in pair] for pair in loops["closed_loop"]]
-
-    axes = pin.LOCAL_WORLD_ALIGNED
-
-    def gap(of):
-        return np.concatenate([of(a) - of(b) for a, b in pairs])
-
-    def place_of(frame):
-        return data.oMf[frame].translation
-
-    def velocity_of(frame):
-        return pin.getFrameJacobian(model, data, frame, axes)[:3]
-
-    def acceleration_of(frame):
-        return pin.getFrameClassicalAcceleration(model, data, frame, axes).linear
-
-    for theta, rate, change in zip(*motions(5), strict=True):
-        turn = np.zeros(model.nv)
-        for name, value in DELTA.joint_positions(tuple(theta.tolist())).items():
-            turn[at[name]] = value
-        posture = pin.integrate(model, pin.neutral(model), turn)
-        pin.computeJointJacobians(model, data, posture)
-        pin.updateFramePlacements(model, data)
-        assert np.abs(gap(place_of)).max() < 1e-8
-        rows = gap(velocity_of)
-        carried = np.zeros((model.nv, 3))
-        carried[driven] = np.eye(3)
-        carried[passive_joints] = -np.linalg.solve(rows[:, passive_joints], rows[:, driven])
-        mass = pin.crba(model, data, posture)
-        mass = np.triu(mass) + np.triu(mass, 1).T
-        expected = carried.T @ mass @ carried
-        found = DELTA.motion(theta[None], rate[None]).mass[0]
-        np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
-        v, a = carried @ rate, carried @ change
-        pin.forwardKinematics(model, data, posture, v, a)
-        a[passive_joints] -= np.linalg.solve(rows[:, passive_joints], gap(acceleration_of))
-        torque = carried.T @ pin.rnea(model, data, posture, v, a)
-        found = DELTA.torque(theta, rate, change)
-        assert np.abs(found - torque).max() < 1e-6 * np.abs(torque).max()
 
 
 # Mutations

@@ -11,13 +11,7 @@ from machines import anywhere, each_machine
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import InputError
-from tpm_gym.kinematics import (
-    ASSEMBLY_MODES,
-    WORKING_MODES,
-    forward_all,
-    inverse_all,
-    jacobian,
-)
+from tpm_gym.kinematics import ASSEMBLY_MODES, WORKING_MODES, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM
 from tpm_gym.mechanism.tpm.rows import LOOPS

@@ -22,12 +22,7 @@ from tpm_gym.kinematics import (
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
-from tpm_gym.mechanism.tpm.bodies import (
-    ACTUATED_JOINTS,
-    build,
-    joint_angles,
-    rotated_joint_angles,
-)
+from tpm_gym.mechanism.tpm.bodies import ACTUATED_JOINTS, build, joint_angles, rotated_joint_angles
 
 GAP = 1e-9
 # Link of the paper's Fig. 1 -> bodies; 3 is rigid with arm 2, 8 with platform 1.
@@ -121,14 +116,11 @@ def test_legs_part_the_links_and_every_closure_joins_two_of_them():
 
 
 @each_machine
-def test_only_the_three_motors_drive_and_none_meets_its_stops_in_the_region(machine):
-    grid = oracle.grid(machine.region.low, machine.region.high, (9, 9, 9)).reshape(-1, 3)
-    theta = np.array([machine.inverse((x, y, z)) for x, y, z in grid.tolist()])
+def test_only_the_three_motors_drive(machine):
     joints = {link.joint.name: link.joint for link in machine.mechanism.links if link.joint}
     assert machine.mechanism.actuated == ACTUATED_JOINTS
-    for angles, joint in zip(theta.T, (joints.pop(name) for name in ACTUATED_JOINTS), strict=True):
+    for joint in (joints.pop(name) for name in ACTUATED_JOINTS):
         assert (joint.kind, joint.parent) == ("revolute", "base")
-        assert joint.lower < angles.min() <= angles.max() < joint.upper
         assert joint.effort == TORQUE_MOTOR.peak_torque
         assert (joint.corner, joint.speed) == (
             TORQUE_MOTOR.corner_speed,

@@ -1,13 +1,12 @@
 """The files in urdf/ are what the mechanism's data give, number by number."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from walk import turn
+from walk import turned
 
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism.bodies import Joint, Link, Solid
@@ -73,14 +72,6 @@ def test_joints_have_the_limits_of_the_tree(mechanism):
             found = [numbers(limit.get(name)) for name in ("lower", "upper", "effort", "velocity")]
             expected = (joint.lower, joint.upper, joint.effort, joint.speed)
             assert np.ravel(found) == pytest.approx(expected, **DIGITS)
-
-
-def turned(rpy: Sequence[float]) -> np.ndarray:
-    """Turn about x, then y, then z, all fixed."""
-    about_x, about_y, about_z = (
-        turn(tuple(axis), a) for axis, a in zip(np.eye(3), rpy, strict=True)
-    )
-    return about_z @ about_y @ about_x
 
 
 def assert_same_solid(element: ElementTree.Element, solid: Any) -> None:

@@ -15,27 +15,14 @@ import safetensors.torch
 import torch
 from gymnasium import spaces
 from gymnasium.vector import SyncVectorEnv
-from policies_on_file import (
-    DATA,
-    WEIGHTS,
-    Weights,
-    described,
-    observations,
-    some_weights,
-    write,
-)
+from policies_on_file import DATA, WEIGHTS, Weights, described, observations, some_weights, write
 from processes import PYTHON, printed_by
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import tpm_gym
 import tpm_gym.policy
 from tpm_gym import TPMEnv
-from tpm_gym.errors import (
-    ConfigurationError,
-    InputError,
-    PolicyFileError,
-    PolicyMismatchError,
-)
+from tpm_gym.errors import ConfigurationError, InputError, PolicyFileError, PolicyMismatchError
 from tpm_gym.policy import load_policy
 from tpm_gym.resources import POLICIES as PUBLISHED
 

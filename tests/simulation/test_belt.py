@@ -136,20 +136,6 @@ def test_each_robot_has_a_speed_of_its_own_and_computes_as_it_does_alone() -> No
         np.testing.assert_array_equal(together[:, row], alone[:, 0])
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_snapshot_keeps_the_speed(engine: str) -> None:
-    line = Line(engine, (-0.1, -0.03, 0.15), [(-0.3, -0.03, 0.015), (-0.4, -0.03, 0.015)])
-    line.run([(STILL, 5)])
-    snapshot = line.simulation.save()
-    after = line.run([(STILL, 5)])
-    other = Line(
-        engine, (-0.1, -0.03, 0.15), [(-0.3, -0.03, 0.015), (-0.4, -0.03, 0.015)], speeds=[-0.1]
-    )
-    other.simulation.restore(snapshot)
-    np.testing.assert_array_equal(other.simulation.state().belt_speed, [SPEED])
-    np.testing.assert_array_equal(other.run([(STILL, 5)]), after)
-
-
 def test_impossible_belts_are_refused() -> None:
     with pytest.raises(ConfigurationError, match="end"):
         Belt(0.1, 0.1)

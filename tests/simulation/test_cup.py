@@ -7,28 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alone import Alone
+from alone import PLACE, SPRUNG, Alone, level
 from inside import around_each_step, from_cup, place_of, push, slide
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.simulation import Block, Plant, Scene, State
 from tpm_gym.simulation.randomisation import NOMINAL
 
-PLACE = np.array([-0.04, 0.028])  # x, y of point P, machine's frame
 G = 9.81
-MASS = PAPER_TPM.mechanism.link("cup").mass
-SPRUNG = CUP.preload + MASS * G
-"""Force of the cup on what it rests on, N."""
 each_engine = pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
 inside_engines = pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
-
-
-def level(height: float) -> FloatArray:
-    """Point P (machine's frame) with the lip at ``height`` above the table."""
-    return np.array([*PLACE, PAPER_TPM.mount.height - height - CUP.length])
 
 
 def start(
@@ -235,9 +225,8 @@ def test_the_cup_yields_to_the_block_at_its_preload_and_comes_out_again(engine, 
         for height in np.arange(0.06, 0.012, -speed):
             simulation.move(level(height))
         state = go(simulation, 0.012, 10, vacuum=False)  # 18 mm below the top of the block
-    blow = (
-        PAPER_TPM.mechanism.link("cup").mass * speed / 0.04 / simulation.engine.time_step
-    )  # stopped in one time step
+    mass = PAPER_TPM.mechanism.link("cup").mass  # stopped in one time step
+    blow = mass * speed / 0.04 / simulation.engine.time_step
     assert max(seen.forces) <= SPRUNG + blow + 0.1
     assert seen.forces[-1] == pytest.approx(SPRUNG, rel=1e-3)
     assert min(seen.slides) == pytest.approx(-0.018, abs=1e-4)

@@ -49,8 +49,6 @@ def watched(simulation: Alone) -> list[tuple[Any, Vector]]:
 
 def hold(simulation: Alone, theta: FloatArray, torque: Vector = REST, periods: int = 1) -> None:
     """Let the servos' references jump to theta and stay there for some control periods."""
-    engine = simulation.engine
-    steps = count_steps(CONTROL_PERIOD, engine.time_step)
     engine: Any = simulation.engine
     steps = count_steps(CONTROL_PERIOD, engine.time_step)
     constant = References(*(np.tile(v, (steps, 1, 1)) for v in (theta, np.zeros(3), torque)))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from alone import Alone
+from alone import PLACE, SPRUNG, Alone, level
 from inside import around_each_step, from_cup, from_table, place_of, push, throw
 
 from tpm_gym.arrays import FloatArray
@@ -23,14 +23,8 @@ DIRECTIONS = [0.0, 22.5, 135.0, 270.0]  # degrees from x
 BLOCK, OTHER = Block(), Block("other")
 BASE = Block("base", width=0.3, height=0.02, mass=5.0)
 AWAY = [(0.25, 0.15), (0.1, 0.15)]  # m; nothing is near
-PLACE = np.array([-0.04, 0.028])  # of P, machine's frame
 UNDER = (PLACE[0], -PLACE[1])  # world
 each_engine = pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
-
-
-def level(height: float, way: Any = (0.0, 0.0)) -> FloatArray:
-    """Point P (machine's frame) with the lip at ``height`` above the table."""
-    return np.array([*(PLACE + way), PAPER_TPM.mount.height - height - CUP.length])
 
 
 def unit(degrees: float) -> FloatArray:
@@ -160,9 +154,8 @@ def test_a_pressing_cup_that_moves_drags_with_mu_n_along_its_way(engine, degrees
         for index in range(1, 9):
             simulation.move(level(0.022, 0.001 * index * unit(degrees)[:2]))
     force, slip = np.mean(rows[20:], axis=0), PAPER_TPM.mount.rotate(unit(degrees))
-    sprung = CUP.preload + PAPER_TPM.mechanism.link("cup").mass * G
-    assert -force[2] == pytest.approx(sprung, rel=0.01)
-    expected = CUP.friction * BLOCK.friction * sprung
+    assert -force[2] == pytest.approx(SPRUNG, rel=0.01)
+    expected = CUP.friction * BLOCK.friction * SPRUNG
     assert np.linalg.norm(force[:2]) == pytest.approx(expected, rel=0.03)
     assert angle(force[:2], slip[:2]) < 3
 

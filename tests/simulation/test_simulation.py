@@ -1,6 +1,6 @@
 """The mechanism in the engine stays a mechanism, and the engine's quirks stay inside."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from states import apart
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Block, Scene, Servo, State
+from tpm_gym.simulation import Block, Scene, Servo
 from tpm_gym.simulation.engine import spline_weights
 
 HOME = np.array(PAPER_TPM.home)
@@ -55,15 +55,6 @@ def test_scenes_that_cannot_be_are_refused(name, value):
     assert caught.value.name == name
 
 
-@pytest.mark.parametrize("blocks", [(), (Block("one"), Block("other"))], ids=len)
-def test_a_state_has_all_of_its_attributes_and_no_other(blocks):
-    simulation = Alone(Scene(objects=blocks))
-    places = {block.name: (0.1 * i, -0.03, 0.015) for i, block in enumerate(blocks)}
-    state = simulation.reset(THETA, places)
-    assert [*vars(state)] == [field.name for field in fields(State)]
-    assert state.object_quaternion.shape == (len(blocks), 4)
-
-
 # -- the mechanism ---------------------------------------------------------------------------------
 
 
@@ -98,18 +89,6 @@ def test_loops_stay_closed_and_the_platform_stays_at_the_forward_kinematics(engi
         assert np.rad2deg(state.platform_tilt) < (1e-5 if engine == "pybullet" else 5e-3)
         assert apart(state) < (0.12e-3 if state.conditioning > 0.08 else 0.15e-3)
         assert not state.passed_singularity
-
-
-@each_machine
-def test_the_platform_comes_to_rest_at_the_command(machine):
-    simulation = Alone(Scene(), machine=machine)
-    simulation.reset(machine.inverse(machine.home))
-    target = anywhere(machine, 1, seed=9)[0]
-    state = follow(simulation, np.linspace(machine.home, target, 20).tolist() + [target] * 20)[-1]
-    world = machine.mount.to_world(target)
-    np.testing.assert_allclose(state.platform_position, world, atol=2e-4)
-    np.testing.assert_allclose(state.command, world, atol=1e-12)
-    assert np.abs(state.theta_dot).max() < 1e-3
 
 
 def test_encoder_rates_and_platform_velocity_obey_the_jacobian(simulation):

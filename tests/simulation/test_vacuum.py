@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation.vacuum import (
-    EMPTY,
-    Hold,
-    Load,
-    hold_after,
-    holds,
-    pressure_after,
-)
+from tpm_gym.simulation.vacuum import EMPTY, Hold, Load, hold_after, holds, pressure_after
 
 STEP = 1 / 250
 FULL = Hold(0, CUP.vacuum)

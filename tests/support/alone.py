@@ -8,11 +8,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import FloatArray
+from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism.cup import CUP
+from tpm_gym.mechanism.mount import GRAVITY
 from tpm_gym.simulation import Plant, Scene, Simulation, State
 from tpm_gym.simulation.randomisation import NOMINAL
 from tpm_gym.simulation.simulation import Snapshot
 
 ROW = np.array([0])
+PLACE = np.array([-0.04, 0.028])  # m, x and y of point P, machine's frame
+SPRUNG = CUP.preload + PAPER_TPM.mechanism.link("cup").mass * GRAVITY
+"""Force of the cup on what it rests on, N."""
+
+
+def level(height: float, way: ArrayLike = (0.0, 0.0)) -> FloatArray:
+    """Point P (machine's frame) with the lip at ``height`` above the table."""
+    return np.array([*(PLACE + way), PAPER_TPM.mount.height - height - CUP.length])
 
 
 class Alone:

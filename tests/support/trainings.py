@@ -50,11 +50,7 @@ PPO_RECIPE = """
 REACH, PICK = "TPMReachDense-v0", "TPMPickAndPlaceDense-v0"
 CASES = {
     "sac": ("sac", "TPMReach-v0", SAC_RECIPE.format(env="TPMReach-v0", train_freq=2)),
-    "tqc": (
-        "tqc",
-        "TPMPickAndPlace-v0",
-        SAC_RECIPE.format(env="TPMPickAndPlace-v0", train_freq=3),
-    ),
+    "tqc": ("tqc", "TPMPickAndPlace-v0", SAC_RECIPE.format(env="TPMPickAndPlace-v0", train_freq=3)),
     "ppo": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=1)),
     "ppo in processes": ("ppo", REACH, PPO_RECIPE.format(env=REACH, envs=2)),
     "ppo in the analytic engine": ("ppo", PICK, PPO_RECIPE.format(env=PICK, envs=3)),

@@ -1,6 +1,6 @@
 """The tree of links, walked joint by joint: where everything is, from the joints alone."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 import pytest
@@ -18,6 +18,12 @@ def turn(axis: tuple[float, ...], angle: float) -> FloatArray:
     return np.asarray(np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k)
 
 
+def turned(rpy: Iterable[float]) -> FloatArray:
+    """Turn about x, then y, then z, all fixed."""
+    x, y, z = (turn(tuple(axis), a) for axis, a in zip(np.eye(3), rpy, strict=True))
+    return z @ y @ x
+
+
 def walk(mechanism: Mechanism, joints: Mapping[str, float]) -> dict[str, Frame]:
     """Position (m) and rotation of every link in the machine's frame, joints in rad or m."""
     frames = {mechanism.links[0].name: (np.zeros(3), np.eye(3))}
@@ -29,8 +35,7 @@ def walk(mechanism: Mechanism, joints: Mapping[str, float]) -> dict[str, Frame]:
         value = joints[joint.name]
         slides = joint.kind == "prismatic"
         origin = position + rotation @ joint.origin
-        for axis, angle in zip(np.eye(3)[::-1], joint.rpy[::-1], strict=True):  # yaw, pitch, roll
-            rotation = rotation @ turn(tuple(axis), angle)
+        rotation = rotation @ turned(joint.rpy)
         if slides:
             frames[link.name] = (origin + value * rotation @ joint.axis, rotation)
         else:

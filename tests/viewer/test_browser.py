@@ -10,10 +10,7 @@ from postures import drawn_gap
 from tpm_gym.viewer import ViewConfig, open_viewer, run
 from tpm_gym.viewer.viewer import Viewer
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")]
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import viser
+from browser import until
 from gantry import GANTRY
 from postures import drawn_gap
 from websockets.sync.client import connect
@@ -128,13 +129,6 @@ def test_a_page_that_drags_p_moves_the_robot(viewer):
         until(lambda: np.allclose(viewer.explore.posture.position, target))
     assert viewer.worker.wait()
     assert drawn_gap(viewer) < 1e-9
-
-
-def until(true: Any, seconds: float = 20.0) -> None:
-    end = time.monotonic() + seconds
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def test_layers_are_drawn_when_shown_and_gone_when_hidden(viewer):

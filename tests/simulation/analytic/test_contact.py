@@ -3,8 +3,6 @@
 import hashlib
 import math
 import os
-import subprocess
-import sys
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from alone import Alone
+from processes import PYTHON, printed_by
 
 from tpm_gym.arrays import FloatArray
 from tpm_gym.mechanism.cup import CUP
@@ -385,14 +384,9 @@ def digest() -> str:
 def test_compiled_code_gives_the_bits_that_python_gives():
     here = Path(__file__).parent
     script = "import sys; sys.path[:0] = sys.argv[1:]; import test_contact as t; print(t.digest())"
-    plain = subprocess.run(
-        [sys.executable, "-c", script, here, here.parents[1] / "support"],
-        env=os.environ | {"NUMBA_DISABLE_JIT": "1"},
-        check=True,
-        capture_output=True,
-        text=True,
-    )
-    assert plain.stdout.strip() == digest()
+    folders = here, here.parents[1] / "support"
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    assert printed_by(PYTHON, "-c", script, *folders, env=environment).strip() == digest()
 
 
 def test_a_row_has_the_same_bits_alone_and_among_others():

@@ -74,7 +74,8 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
         return weight - payload * (now - 2 * at + before) / time_step**2, carried
 
     def energy(course):
-        return kinetic_and_potential(course.theta, course.rates, payload)
+        dynamics = Dynamics(payload=payload, free_fall=PAPER_TPM.mount.free_fall)
+        return dynamics.energy(course.theta, course.rates)
 
     start, count = at_rest(theta), round(0.08 / time_step)
     course = at_rest(theta, payload)._replace(force=weight)
@@ -83,11 +84,6 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
     kinetic, _ = after = energy(course)
     assert (kinetic > 0.05).all()
     return sum(after) - sum(energy(start))
-
-
-def kinetic_and_potential(theta: Any, rates: Any, payload: float = 0.0) -> Any:
-    fall = PAPER_TPM.mount.free_fall
-    return Dynamics(payload=payload, free_fall=fall).energy(theta, rates)
 
 
 @pytest.mark.parametrize("payload", [0.0, 0.5])

@@ -2,13 +2,13 @@
 
 import os
 import subprocess
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 from alone import Alone
 from numpy.typing import NDArray
+from processes import PYTHON
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM
@@ -112,7 +112,5 @@ for env in envs:
     except tpm_gym.TPMError:
         pass
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
+    done = subprocess.run([PYTHON, "-c", script], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")
