@@ -18,6 +18,7 @@ Importing this module imports Numba.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from tpm_gym.arrays import FloatArray, is_number
 from tpm_gym.compiling import kept
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
+from tpm_gym.simulation.engine import loops
 from tpm_gym.tasks.control import Control, Follower
 
 __all__ = ["BrakingShield", "Shield", "make_shield"]
@@ -46,6 +48,7 @@ _SWEEPS = 200  # of the quadratic program, at most
 _NUDGE = 1e-4  # of a step, for derivatives of the conditioning
 
 
+@cache
 def _nodes() -> FloatArray:
     """Return weights (7, 3) of m, c, d for points on curve and line: one parabola in turn."""
     s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
@@ -83,23 +86,17 @@ class Shield:
         control: Control of the environment.
         least: Smallest conditioning on the path of the commands.
 
-    Raises:
-        ConfigurationError: If the machine's home has less.
     """
 
     def __init__(self, machine: Machine, control: Control, least: float) -> None:
-        """Check that home is safe."""
+        """Keep the arguments."""
         self._machine, self._control, self.least = machine, control, least
-        self._nodes, self._step = _nodes(), np.array(machine.step_limit)
+        self._step = np.array(machine.step_limit)
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
         # The last commands, and how many in turn have been far from the border: a cache, so that
         # these commands are not computed again.
         self._last: FloatArray = np.empty((0, 2, 3))
         self._far = np.empty(0, dtype=np.int64)
-        home = float(machine.conditioning_at(machine.home))
-        if home < least + TOLERANCE:
-            valid = f"at most {home - TOLERANCE:.3g}, the conditioning of {machine.name!r} at home"
-            raise ConfigurationError("shield", least, valid)
 
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
         """Return the safe commands (n, 3) m that are nearest to the wanted ones.
@@ -127,8 +124,7 @@ class Shield:
 
     def _lack(self, corners: FloatArray) -> FloatArray:
         """Return the conditioning (r,) that the path with corners (r, 3, 3) m, c, d lacks."""
-        points = placed(corners, self._nodes)
-        return self.least + TOLERANCE / 2 - lowest(self._machine.conditioning_at(points))
+        return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
         """Return the safe commands (r, 3) m nearest to the corners d."""
@@ -201,7 +197,6 @@ class BrakingShield:
     def __init__(self, machine: Machine, follower: Follower, least: float) -> None:
         """Keep the arguments."""
         self._machine, self._follower, self.least = machine, follower, least
-        self._nodes = _nodes()
 
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
         """Return safe commands (n, 3) m between braking and the wanted ones.
@@ -236,8 +231,7 @@ class BrakingShield:
         rows, (before, current), then = np.arange(len(command)), recent.swapaxes(0, 1), command
         for _ in range(_LONGEST):
             corners = np.stack([(before + current) / 2, current, then], axis=1)
-            points = placed(corners, self._nodes)
-            least = lowest(self._machine.conditioning_at(points))
+            least = _lowest_on_path(self._machine, corners)
             least[~self._follower.feasible(before, current, then)] = -np.inf
             found[rows] = np.minimum(found[rows], least)
             going = (then != current).any(axis=1) & (found[rows] > 0)
@@ -274,23 +268,20 @@ def make_shield(
     if not is_number(least) or not 0 < least <= 1:
         valid = "False, True, or a conditioning in (0, 1] to keep"
         raise ConfigurationError("shield", shield, valid)
-    plain = Shield(machine, control, float(least))
-    return plain if follower is None else BrakingShield(machine, follower, plain.least)
+    home = float(machine.conditioning_at(machine.home))
+    if home < least + TOLERANCE:
+        valid = f"at most {home - TOLERANCE:.3g}, the conditioning of {machine.name!r} at home"
+        raise ConfigurationError("shield", least, valid)
+    if follower is None:
+        return Shield(machine, control, float(least))
+    return BrakingShield(machine, follower, float(least))
 
 
-@kept
-def placed(corners: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return points (r, k, 3) with weights (k, 3) of corners (r, 3, 3)."""
-    points = np.empty((len(corners), len(weights), 3))
-    for row in range(len(corners)):
-        for k in range(len(weights)):
-            for axis in range(3):
-                points[row, k, axis] = (
-                    weights[k, 0] * corners[row, 0, axis]
-                    + weights[k, 1] * corners[row, 1, axis]
-                    + weights[k, 2] * corners[row, 2, axis]
-                )
-    return points
+def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
+    """Return the smallest conditioning (r,) on paths with the corners (r, 3, 3) m, c, d."""
+    points = loops().spline_points(corners, _nodes())
+    found: FloatArray = lowest(machine.conditioning_at(points))
+    return found
 
 
 @kept

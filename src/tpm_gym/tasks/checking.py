@@ -51,9 +51,7 @@ def check(task: Task, taken: Sequence[str] = ()) -> None:
         alone = _results(task, several.take([row]))
         for name, values in together.items():
             if np.shape(values)[:1] != (_EXAMPLES,) or not _equal(values[row], alone.get(name)):
-                valid = "values (n, ...) for n robots, each from its own row; reduce by axis=-1"
-                shape = f"of shape {np.shape(values)} for {_EXAMPLES}"
-                raise ConfigurationError(name, shape, valid)
+                raise _wrong_rows(name, values, "(n, ...)")
 
 
 def _results(task: Task, state: State) -> dict[str, Any]:
@@ -100,9 +98,12 @@ def _check_shapes(task: Task, state: State) -> None:
 def _require_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
     """Refuse values that are not of this shape for each robot."""
     if np.shape(values) != (_EXAMPLES, *shape):
-        wanted = f"(n, {shape[0]})" if shape else "(n,)"
-        valid = f"values {wanted} for n robots, each from its own row; reduce by axis=-1"
-        raise ConfigurationError(name, f"of shape {np.shape(values)} for {_EXAMPLES}", valid)
+        raise _wrong_rows(name, values, f"(n, {shape[0]})" if shape else "(n,)")
+
+
+def _wrong_rows(name: str, values: Any, wanted: str) -> ConfigurationError:
+    valid = f"values {wanted} for n robots, each from its own row; reduce by axis=-1"
+    return ConfigurationError(name, f"of shape {np.shape(values)} for {_EXAMPLES}", valid)
 
 
 def _equal(row: Any, single: Any) -> bool:

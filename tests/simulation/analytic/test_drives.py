@@ -11,7 +11,7 @@ from episodes import EVERYTHING, OF_SERVOS, expert_episode
 from inside import around_each_step
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
 from tpm_gym.mechanism.tpm.dynamics import Dynamics
 from tpm_gym.simulation import Plant, Scene, Servo, Simulation
 from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, march
@@ -104,6 +104,19 @@ def test_motors_with_torque_to_spare_are_where_they_shall_be():
     np.testing.assert_allclose(torques, expected, atol=1e-8)
     np.testing.assert_allclose(course.theta, theta[-1], atol=1e-12)
     assert not steps.behind.any()
+
+
+def test_no_motor_exceeds_its_largest_torque_next_to_a_singularity():
+    robot = Alone(machine=WIDE_TPM, engine="analytic", physics={"torques": "every"})
+    home, end = np.array(WIDE_TPM.home), np.array((0.816, 0.551, 0.502))
+    assert WIDE_TPM.conditioning_at(end) < 1e-4
+    robot.reset(WIDE_TPM.inverse(home + 0.85 * (end - home)))
+    for _ in range(2):
+        state = robot.move(end)
+        assert not state.passed_singularity
+        assert np.abs(robot.engine.torques).max() == 100  # rounding errors made it 7e6
+    lag = WIDE_TPM.inverse(end) - state.theta
+    np.testing.assert_array_equal(state.torque, 100 * np.sign(lag))
 
 
 # -- against PyBullet ------------------------------------------------------------------------------

@@ -73,7 +73,11 @@ def ideal_step(
         short = resisted(mass, impulse, plus(_ZERO, row_of(effort, row), step))
         behind[0, row] = behind[1, row]
         behind[1, row] = short[0] != 0 or short[1] != 0 or short[2] != 0
-        put_row(new[2], row, plus(_ZERO, plus(spread(mass, short), impulse, -1.0), rate))
+        torque = plus(_ZERO, plus(spread(mass, short), impulse, -1.0), rate)
+        for i in range(3):  # next to a singularity, ``torque`` is mostly rounding errors
+            most = effort[row, i]
+            held = max(-most, min(torque[i], most))
+            new[2][row, i] = held if short[i] == 0 else -np.sign(short[i]) * most
         _integrate(row, plus(goal, short), course, at, step, new)
 
 
