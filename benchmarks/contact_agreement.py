@@ -4,7 +4,7 @@
 
 Two blocks are let go on each other, pushed over, pushed side by side, dragged and put down. Rest
 poses are compared with those of MuJoCo at 0.5 ms, and MuJoCo's own with those at 0.25 ms. A block
-of 40 mm is struck by the lip at full speed, higher each time, until it topples.
+of 40 mm is struck by the lip at full speed, higher each time, until it topples, and off its middle.
 
 How often a policy succeeds in each engine is measured by ``engine_limits.py``.
 """
@@ -31,6 +31,8 @@ WIDTH, HEIGHT = BLOCKS[0].width, BLOCKS[0].height
 MIDDLE = np.array([0.3, -0.36, 0.0])
 KINDS = ("rest", "over", "side", "drag", "put")
 HEIGHTS = (0.027, 0.0275, 0.028, 0.0285, 0.029, 0.0295, 0.030, 0.0305, 0.031, 0.032, 0.033, 0.034)
+LOW, ASIDE = 0.012, 0.008
+"""Height of the lip that strikes a block off its middle, and how far off, m."""
 TOPPLED = math.radians(45)
 
 
@@ -118,12 +120,15 @@ def cases(count: int) -> list[Case]:
     return [draw(kind, np.random.default_rng([3, k])) for k, kind in enumerate(kinds)]
 
 
-def strike(height: float) -> Case:
-    """Return a case in which the lip, ``height`` m above the table, hits a block at full speed."""
+def strike(height: float, aside: float = 0.0) -> Case:
+    """Return a case in which the lip, ``height`` m above the table, hits a block at full speed.
+
+    The block's middle is ``aside`` m beside the lip's way.
+    """
     start = MIDDLE + np.array([-0.09, 0.0, height + CUP.length])
     stop = start + np.array([0.12, 0.0, 0.0])
     commands = [start, *line(start, stop, 4), *[stop] * 10]
-    place = MIDDLE + np.array([0.0, 0.0, TALL.height / 2])
+    place = MIDDLE + np.array([0.0, aside, TALL.height / 2])
     return Case(place[None], np.array(commands), [False] * len(commands))
 
 
@@ -182,6 +187,11 @@ def main() -> None:
         struck = play([strike(height) for height in HEIGHTS], engine, step, [TALL])
         lowest = next(h for h, found in zip(HEIGHTS, struck, strict=True) if found.toppled)
         print(f"  a struck block topples from {1000 * lowest:.1f} mm on")
+        (low,) = play([strike(LOW, ASIDE)], engine, step, [TALL])
+        sideways = low.places[0, 1] - MIDDLE[1] - ASIDE
+        print(
+            f"  hit {1000 * ASIDE:.0f} mm off its middle it moves {1000 * sideways:.1f} mm sideways"
+        )
 
 
 if __name__ == "__main__":
