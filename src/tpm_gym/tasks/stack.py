@@ -78,10 +78,13 @@ class Stack(Task):
         """Carry the lower block to its place, then the upper block on top of it."""
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
-            while not motion.holding(block.name):
-                yield from motion.pick(block, CLEARANCE)
+            while True:
+                if not motion.holding(block.name):  # else: of an episode that was restored
+                    yield from motion.pick(block, CLEARANCE)
                 place = motion.carried_to(goal, block.name)
                 way = [motion.command + up, place + up, place]
                 yield from motion.go(way, vacuum=True, while_holding=block.name)
+                if motion.holding(block.name):
+                    break
             yield Move(place, False)
             yield from motion.go([place + up], vacuum=False)
