@@ -92,7 +92,7 @@ def describe(
 
 @dataclass(frozen=True, eq=False)
 class Topology(poc.ParallelMechanism):
-    """Topology from :func:`analyse`, the paper's decomposition (I and II, then III) first.
+    """Result of :func:`analyse`. The paper's decomposition (I and II, then III) comes first.
 
     Attributes:
         sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' on branches I and II.

@@ -67,7 +67,7 @@ class EnvOptions:
         str,
         unset(Literal["ideal", "servo"], "the id's; evaluate: the policy's", "{ideal,servo}"),
     ] = UNSET
-    """Motors: ideal ones follow every command exactly, servo drives have limited torque."""
+    """Motors: ideal ones follow commands exactly up to their peak torque; servo drives lag."""
 
     shield: bool = False
     """Replace actions by the nearest ones that keep clear of singularities."""

@@ -251,7 +251,7 @@ def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
         table.add_row(label, *cells)
         worst = [show(estimate.worst) + unit for estimate in found if estimate.worst is not None]
         if worst:
-            table.add_row("  worst of all steps", *worst, style="dim")
+            table.add_row("  worst episode", *worst, style="dim")
     rates = [f"{result.as_dict()['steps_per_second']:.0f}" for result in results]
     table.add_row("steps per second", *rates)
     return table

@@ -112,7 +112,7 @@ class AnalyticVecEnv(VecEnv):
         return {"rngs": snapshot.rngs, "plants": [asdict(plant) for plant in plants]}, arrays
 
     def restore(self, plain: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> Observation:
-        """Restore a state of :meth:`state`; return the observation at that moment."""
+        """Restore what :meth:`state` returned; return the observation at that moment."""
         plants = tuple(map(_plant, plain["plants"])) or (NOMINAL,) * self.num_envs
         envs, simulation, engine = (starting(arrays, p) for p in (_ENVS, _SIMULATION, _ENGINE))
         self._returns, self._lengths = arrays["returns"].copy(), arrays["lengths"].copy()

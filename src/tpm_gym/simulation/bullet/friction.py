@@ -144,7 +144,7 @@ class Friction:
             belt.speed = speed
 
     def alter(self, factor: float) -> None:
-        """Store the factor of the objects' nominal friction coefficients."""
+        """Set the factor by which the objects' friction differs from nominal."""
         self._factor = factor
 
     def prepare(self, near: Sequence[int], first: int) -> int:
