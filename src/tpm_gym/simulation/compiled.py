@@ -295,10 +295,10 @@ def friction_force(
     x, y, z = cross(arm, plus((0.0, 0.0, 0.0), slip, 1 / speed))
     mobility = 1 / mass + x * x / moments[0] + y * y / moments[1] + z * z / moments[2]
     ending = plus((0.0, 0.0, 0.0), slip, -1 / (mobility * step))
-    kept = plus(plus(before, normal, -dot(before, normal)), ending, 0.5)
-    kept = _at_most(kept, most)
-    force = _at_most(plus(kept, ending), most)
-    return force, plus((0.0, 0.0, 0.0), force, -1.0), kept
+    steady = plus(plus(before, normal, -dot(before, normal)), ending, 0.5)
+    steady = _at_most(steady, most)
+    force = _at_most(plus(steady, ending), most)
+    return force, plus((0.0, 0.0, 0.0), force, -1.0), steady
 
 
 @compiled
