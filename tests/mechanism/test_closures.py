@@ -18,6 +18,7 @@ HOME = PAPER_TPM.joint_positions((A, B, C))
 
 
 def test_the_machines_are_sound() -> None:
+    """The check raises otherwise, as the tests below show."""
     require_sound(SOUND, HOME)
     require_sound(GANTRY.mechanism, GANTRY.joint_positions(GANTRY.home))  # a tree of slides
 

@@ -85,7 +85,6 @@ class Shield:
         machine: Nominal machine.
         control: Control of the environment.
         least: Smallest conditioning on the path of the commands.
-
     """
 
     def __init__(self, machine: Machine, control: Control, least: float) -> None:

@@ -268,7 +268,7 @@ def friction_force(
     mass: float,
     moments: Vector,
     step: float,
-) -> tuple[Vector, Vector, Vector]:
+) -> tuple[Vector, Vector]:
     """Compute Coulomb's friction on a block for the next time step, from the slip in the last.
 
     The force ends the slip within a few time steps. A sticking contact needs a force without slip.
@@ -286,7 +286,7 @@ def friction_force(
         step: Time step, s.
 
     Returns:
-        The friction on the block and on the other body, and the sum of earlier forces then, N.
+        The friction on the block, and the sum of earlier forces then, N.
     """
     arm = plus(point, place, -1.0)
     slip = plus(plus(motion[0], cross(motion[1], arm)), motion[2], -1.0)
@@ -297,8 +297,7 @@ def friction_force(
     ending = plus((0.0, 0.0, 0.0), slip, -1 / (mobility * step))
     steady = plus(plus(before, normal, -dot(before, normal)), ending, 0.5)
     steady = _at_most(steady, most)
-    force = _at_most(plus(steady, ending), most)
-    return force, plus((0.0, 0.0, 0.0), force, -1.0), steady
+    return _at_most(plus(steady, ending), most), steady
 
 
 @compiled

@@ -197,7 +197,8 @@ class Friction:
                     self._set(belt, _scales(motion, (belt.speed, 0.0), on_belt, rough))
             if beside:
                 self._set(cup, _BOX)
-                self._pushes[index] = self._resist(body, beside, push, rough * CUP.friction)
+                coefficient = rough * CUP.friction
+                self._pushes[index] = self._resist(body, motion, beside, push, coefficient)
             elif lip and index != held:
                 u, v, _ = self._lip_velocity()
                 self._set(cup, _scales(motion, (u, v), lip, rough * CUP.friction))
@@ -206,7 +207,9 @@ class Friction:
         state = pybullet.getLinkState(self._cup.body, self._cup.link, 1, 0, self._number)
         return state[6]  # type: ignore[no-any-return]  # PyBullet has no types
 
-    def _resist(self, body: int, points: Sequence[Any], last: _Push, coefficient: float) -> _Push:
+    def _resist(
+        self, body: int, motion: _Motion, points: Sequence[Any], last: _Push, coefficient: float
+    ) -> _Push:
         """Apply the friction that the solver leaves out where the lip pushes a side of an object.
 
         The points count as one contact at the point with the largest force. A blow lasts one time
@@ -214,6 +217,7 @@ class Friction:
 
         Args:
             body: Body id of the object.
+            motion: Motion of the object.
             points: PyBullet's contact points.
             last: The last push.
             coefficient: Coulomb's coefficient of the contact.
@@ -222,14 +226,14 @@ class Friction:
         normal = sum(point[9] for point in points)
         solved = sum(math.hypot(point[10], point[12]) for point in points)
         mass, _, moments, *_ = pybullet.getDynamicsInfo(body, -1, number)
-        place, *own = _Motion.of(body, number)
-        motion = *own, self._lip_velocity()
-        contact, most = (point[5], point[7], place), coefficient * normal - solved
+        most = coefficient * normal - solved
+        contact, moving = (point[5], point[7], motion.place), (*motion[1:], self._lip_velocity())
         before, limit = last[0], min(last[1], most)
-        force, back, after = self._friction_force(
-            *contact, motion, before, limit, mass, moments, self._step
+        force, after = self._friction_force(
+            *contact, moving, before, limit, mass, moments, self._step
         )
-        for pushed, push in (((body, -1), force), ((cup.body, cup.link), back)):
+        x, y, z = force
+        for pushed, push in (((body, -1), force), ((cup.body, cup.link), (-x, -y, -z))):
             pybullet.applyExternalForce(*pushed, push, point[5], pybullet.WORLD_FRAME, number)
         return after, most
 
