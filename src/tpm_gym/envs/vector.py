@@ -225,11 +225,10 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         if not plain or actions.shape != self._shape or not np.isfinite(actions).all():
             actions = finite("actions", actions, self._shape, ActionError)
         self._require_running()
-        values = actions.astype(np.float64)
         if len(self._parts) == 1:
-            observation, reward, ended, info = self._parts[0].step(values)
+            observation, reward, ended, info = self._parts[0].step(actions)
         else:
-            found = self._each(lambda part, rows: part.step(values[rows]))
+            found = self._each(lambda part, rows: part.step(actions[rows]))
             observations, rewards, ends, infos = zip(*found, strict=True)
             observation, info = self._merged(zip(observations, infos, strict=True))
             reward, ended = np.concatenate(rewards), np.concatenate(ends)
@@ -413,12 +412,12 @@ class _Part:
         return infos
 
     def step(
-        self, actions: FloatArray
+        self, actions: NDArray[Any]
     ) -> tuple[Observation, FloatArray, BoolArray, dict[str, Any]]:
         """Run a control step, and reset environments whose episode ended."""
         core = self.core
         renewed = np.flatnonzero(self.ended)
-        core.step(actions, np.flatnonzero(~self.ended))
+        core.step(actions.astype(np.float64), np.flatnonzero(~self.ended))
         self.elapsed += 1
         infos = {}
         if len(renewed):

@@ -167,6 +167,11 @@ class Path:
         """Store the arguments."""
         self.machine, self.commands, self.weights, self._bias = machine, commands, weights, bias
 
+    def take(self, rows: IntArray) -> Path:
+        """Return the paths of some robots."""
+        bias = None if self._bias is None else self._bias[rows]
+        return Path(self.machine, self.commands[rows], self.weights, bias)
+
     def points(self, last: int = 0) -> FloatArray:
         """Return point P (n, k, 3) m at the ends of the last k time steps (0: all time steps)."""
         points: FloatArray = loops().spline_points(self.commands, self.weights[-last:])

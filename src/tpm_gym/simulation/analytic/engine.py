@@ -208,7 +208,7 @@ class AnalyticEngine:
         for name, values in start.items():
             getattr(self, name)[rows] = values[rows]
         self._contact.undo(rows)
-        joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
+        joints = np.ascontiguousarray(path.take(rows).joints().swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
         self._integrate(rows, steps, len(path.weights), vacuum)
         self._behind[rows] = steps.behind
@@ -269,7 +269,8 @@ class AnalyticEngine:
         over = loops().beyond(last, _CHECK_ABOVE * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
-            whole = np.concatenate([*lead, path.joints()], axis=1)[rows]
+            before = [part[rows] for part in lead]
+            whole = np.concatenate([*before, path.take(rows).joints()], axis=1)
             torques = self._torques(rows, whole, push[rows])
             over[rows] = loops().beyond(torques, self._effort[rows])
         return over
