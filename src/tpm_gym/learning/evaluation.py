@@ -86,7 +86,7 @@ class EvaluationConfig:
     """Episodes of the video."""
 
     picture: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """PNG of six moments of the first episode; several policies get a file each."""
+    """PNG of six different moments of the first episode; several policies get a file each."""
 
     camera: Literal["table", "overview", "cup"] = "table"
     """Camera of video and picture: the task region, the whole robot, or close to the cup."""
@@ -289,9 +289,8 @@ def _film(config: EvaluationConfig, console: Console) -> None:
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
         policies = _load(config, envs)
-        write_film = partial(write_video, fps=envs.metadata["render_fps"])
-        films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
-            ("video", config.video, count, write_film),
+        films: tuple[tuple[str, Path | None, int, Callable[[Path, Play, float], None]], ...] = (
+            ("video", config.video, count, write_video),
             ("picture", config.picture, 1, write_contact_sheet),
         )
         for kind, file, episodes, write in films:
@@ -299,7 +298,8 @@ def _film(config: EvaluationConfig, console: Console) -> None:
             for path, policy in zip(paths, policies, strict=False):
                 console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
                 with bar(console, kind, episodes * frames) as advance:
-                    write(path, partial(_play, envs, policy, episodes, config.seed, advance))
+                    play = partial(_play, envs, policy, episodes, config.seed, advance)
+                    write(path, play, envs.metadata["render_fps"])
 
 
 def _play(
