@@ -288,7 +288,10 @@ def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
 
 
 def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
-    """Return the independent loops for each order of the chains, about ``point`` (3,) m."""
+    """Return the independent loops, for each order in which the chains can be joined.
+
+    Motions are those of ``point``, (3,) m.
+    """
     return tuple(_loops(order) for order in permutations([(c, c.poc(point)) for c in chains]))
 
 

@@ -257,7 +257,7 @@ class Simulation:
         return self._mode_left
 
     def state(self) -> State:
-        """Return the state of all robots; after a move or reset, read the engine once.
+        """Return the state of all robots. The engine is read once after each move or reset.
 
         Raises:
             ClosureError: If a loop has opened.

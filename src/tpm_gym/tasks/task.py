@@ -354,14 +354,19 @@ class Task(ABC):
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the low and high corners (3,) m of the places where a block may start.
 
-        They are what the robot can reach. A task whose blocks come from elsewhere overrides this.
+        By default the robot can reach them all. A task whose blocks come from elsewhere overrides
+        this.
         """
         return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return boxes, as lowest and highest place (3,) m, of goals for point P or for a block.
+        """Return the boxes in which goals lie, as low and high corners (3,) m each.
 
-        They are what the robot can reach. A task that aims elsewhere overrides this.
+        By default there is one box: the reach of point P, or of a block in the cup. A task with
+        goals elsewhere overrides this.
+
+        Args:
+            block: The block whose goals they are; None for goals of point P.
         """
         return [self.reach_of(block)]
 
