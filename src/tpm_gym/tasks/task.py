@@ -197,7 +197,7 @@ class Task(ABC):
         return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Yield the moves of the scripted controller for one robot; the last move is kept.
+        """Yield the moves of the expert for one robot; the last move is kept.
 
         Raises:
             ConfigurationError: If the task has no plan.
