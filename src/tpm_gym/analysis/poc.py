@@ -7,7 +7,7 @@ intersection the common subspace, separately for translations and rotations, as 
 contributes t along s x (o' - p), unless the axis passes through the base point o' of the end link.
 
 Subspaces replace the paper's symbols for directions. Choose the base point so that no element is
-dependent; there is no notation for dependent elements, as the paper's braces. The sets are exact
+dependent; there is no notation for dependent elements (the paper has braces). The sets are exact
 for chains that translate and rotate independently, as all chains of this mechanism do. They
 describe one configuration. Dimensions can change at a singularity; elsewhere they are the full-
 cycle values of the paper.

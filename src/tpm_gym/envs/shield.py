@@ -77,11 +77,11 @@ class Problem(NamedTuple):
 
 
 class Shield:
-    """Replacement of unsafe commands by the nearest safe ones, for n robots.
+    """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
     Distances between commands are Euclidean, in units of the action: of increments of P with
-    Cartesian control, of the joints with joint control. What the control cuts off from an action
-    does not count. A nearer safe command is nearer by some 0.001 at most.
+    Cartesian control, of the joints with joint control. They are measured from the command that
+    the control makes of the action. No other safe command is nearer by more than about 0.001.
 
     Args:
         machine: Nominal machine.

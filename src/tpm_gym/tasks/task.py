@@ -84,9 +84,9 @@ class Task(ABC):
         controls: Names of the controls that can perform the task.
         events: Names of methods of the task. ``info`` has their results for the state, (n,) bool,
             and an evaluation the share of episodes in which each was true after a step.
-        control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
-            scaled to it. In shorter periods commands can ask for more torque than the motors have,
-            unless :attr:`accelerations` are set; a shield requires them then.
+        control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
+            scaled to this time. In shorter periods commands can ask for more torque than the motors
+            have, unless :attr:`accelerations` are set; a shield requires them then.
         accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
             and its deceleration before the ends of the region, m/s^2; None for any.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.

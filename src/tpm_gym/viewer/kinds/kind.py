@@ -98,7 +98,7 @@ class Kind:
             the working mode.
         working: Working modes by the entries chosen in the lists between.
         assembly: Assembly modes by operation mode and label.
-        lows: Lower ends of the sliders of three motors, degrees. A slide has its stops.
+        lows: Lower ends of the sliders of three motors, degrees. Those of a slide are its stops.
     """
 
     lists: Mapping[str, str] = {"Operation": "Operation mode", "Assembly": "Assembly mode"}
