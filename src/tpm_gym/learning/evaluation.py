@@ -289,17 +289,17 @@ def _film(config: EvaluationConfig, console: Console) -> None:
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
         policies = _load(config, envs)
-        films: tuple[tuple[str, Path | None, int, Callable[[Path, Play, float], None]], ...] = (
-            ("video", config.video, count, write_video),
-            ("picture", config.picture, 1, write_contact_sheet),
+        fps = envs.metadata["render_fps"]
+        films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
+            ("video", config.video, count, partial(write_video, fps=fps)),
+            ("picture", config.picture, 1, partial(write_contact_sheet, fps=fps)),
         )
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
                 console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
                 with bar(console, kind, episodes * frames) as advance:
-                    play = partial(_play, envs, policy, episodes, config.seed, advance)
-                    write(path, play, envs.metadata["render_fps"])
+                    write(path, partial(_play, envs, policy, episodes, config.seed, advance))
 
 
 def _play(
