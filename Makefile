@@ -40,7 +40,7 @@ demo-film:
 	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json --episodes 2 --seed 2000006 \
 		--video runs/demo/pick_and_place.mp4 --picture runs/demo/pick_and_place.png
 
-test: $(INSTALLED) ## the gate, here and in CI: lint, types, fast tests
+test: $(INSTALLED) ## all checks, here and in CI: lint, types, fast tests
 	$(MAKE) -j2 lint compiled
 	$(MAKE) test-fast
 

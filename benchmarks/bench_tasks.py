@@ -108,7 +108,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     groups = [(name, "expert", *_conditions(other)) for name in IDS for other in OTHERS]
     groups += dict.fromkeys(tuple(cell[name] for name in _KEY[:-1]) for cell in trained)
     yield from table(
-        ["task", "controller", "machine", "goals", "analytic", "pybullet"],
+        ["task", "played by", "machine", "goals", "analytic", "pybullet"],
         [
             [group[0], _controller(group[1]), *group[2:]]
             + [shown(*group, engine) for engine in ENGINES[:2]]

@@ -29,7 +29,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _CACHING: Any = caching
 PATIENCE: Final = 1.0
-"""Time of compiling without a message, s."""
+"""Time after which a message says that functions are being compiled, s."""
 _LOGGER: Final = logging.getLogger("tpm_gym")
 
 
@@ -61,11 +61,11 @@ class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has
     stamp = ""
 
     def reduce(self, cres: Any) -> Any:
-        """Return what is written."""
+        """Return the stamp and Numba's data, which are written to the file."""
         return self.stamp, super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Return the machine code; None if it is of other sources.
+        """Return the machine code; None if other sources were compiled.
 
         Numba writes a new index first, then the code. A process that is killed in between, or reads
         in between, would take the code of other sources for this function's.

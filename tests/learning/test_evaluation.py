@@ -26,6 +26,7 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, provenance
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError, PolicyError
+from tpm_gym.learning.film import write_contact_sheet
 from tpm_gym.policy.files import digest
 from tpm_gym.tasks import Reach
 
@@ -150,8 +151,29 @@ def test_picture_shows_six_moments_of_the_first_episode(short, tmp_path):
     env.close()
     picture = imageio.imread(path)
     height, width = first.shape[:2]
-    assert picture.shape == (2 * height, 3 * width, 3)
+    assert picture.shape[0] > 2 * height
+    assert picture.shape[1] > 3 * width
     np.testing.assert_array_equal(picture[:height, :width], first)
+    below = picture[height : picture.shape[0] // 2, :width]
+    assert below.min() < 50 < 200 < below.mean()  # the time, black on white
+
+
+def test_picture_shows_the_motion_at_the_start_of_a_long_episode(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 40, (50, 24, 32, 3)).astype(np.uint8)
+    frames[:4] += np.array([200, 150, 100, 50], np.uint8)[:, None, None, None]
+    path = tmp_path / "reach.png"
+
+    def play(use):
+        for frame in frames:
+            use(frame)
+
+    write_contact_sheet(path, play, 25.0)
+    shown = imageio.imread(path)
+    left = [shown[row : row + 24, column : column + 32]
+            for row in (0, 24 + 32) for column in (0, 40, 80)]  # fmt: skip
+    for frame, expected in zip(left, (*frames[:4], None, frames[-1]), strict=True):
+        assert expected is None or (frame == expected).all()
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,7 @@ class Classification:
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """Nearest singular position of each point; NaN (-1 for factor) where not valid.
+    """Nearest singular position of each point; NaN where not valid, and -1 as its factor.
 
     Attributes:
         distance: (...,) m.
@@ -77,7 +77,7 @@ class NearestSingularity:
 
 
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
-    """Divide the factors by lengths, so that one tolerance suits all; return (..., 8).
+    """Return the factors (..., 8) over lengths, so that one tolerance suits all.
 
     level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
     """

@@ -362,7 +362,7 @@ class Core:
         return EnvSnapshot(self.kind, self._save_simulation(), rngs, copies)
 
     def _save_simulation(self) -> Snapshot:
-        """Return a snapshot; :attr:`state` is that of the restarted simulation then."""
+        """Return a snapshot, and read :attr:`state` again: the simulation restarts from it."""
         snapshot = self.simulation.save()
         self._state = self.simulation.state()
         return snapshot

@@ -1,14 +1,16 @@
 """Shield: the nearest command that keeps the machine away from singularities.
 
 Let c be the last command, d the next one, and m the middle of the last two commands. In a control
-period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If d is held
-then, P moves on to d in a straight line. The command d is safe if the conditioning 1/cond(J) stays
-at ``least`` or above on both. So it is always safe to hold the last command.
+period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If the
+command then stays at d, P moves on to d in a straight line. The command d is safe if the
+conditioning 1/cond(J) stays at ``least`` or above on curve and line. So it is always safe to hold
+the last command.
 
 Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex.
 Therefore the nearest command is mostly the nearest point of the surface ``conditioning = least``.
 It is found by sequential quadratic programming, and the path is checked. Where the check fails, the
-aim is raised, and at last the command is moved towards the last one.
+search is repeated with a larger conditioning as its aim. Where that fails too, the command is moved
+towards the last one.
 
 Where a task bounds the accelerations of commands, a robot cannot hold the last command at once.
 There :class:`BrakingShield` asks that the robot can still brake in time.
@@ -50,14 +52,14 @@ _NUDGE = 1e-4  # of a step, for derivatives of the conditioning
 
 @cache
 def _nodes() -> FloatArray:
-    """Return weights (7, 3) of m, c, d for points on curve and line: one parabola in turn."""
+    """Return weights (7, 3) of m, c and d for seven points: five on the curve, two on the line."""
     s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
     curve = np.hstack([(1 - s) ** 2, 2 * s * (1 - s) + s**2 / 2, s**2 / 2])
     return np.vstack([curve, [[0.0, 0.25, 0.75], [0.0, 0.0, 1.0]]])
 
 
 class Problem(NamedTuple):
-    """Nearest safe commands of r robots that are looked for.
+    """Search for the nearest safe commands of r robots.
 
     Attributes:
         wanted: (r, 3) wanted commands, in units of the action.
@@ -75,11 +77,11 @@ class Problem(NamedTuple):
 
 
 class Shield:
-    """Replacement of unsafe commands by the nearest safe ones, for n robots.
+    """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
     Distances between commands are Euclidean, in units of the action: of increments of P with
-    Cartesian control, of the joints with joint control. What the control cuts off from an action
-    does not count. A nearer safe command is nearer by some 0.001 at most.
+    Cartesian control, of the joints with joint control. They are measured from the command that
+    the control makes of the action. No other safe command is nearer by more than about 0.001.
 
     Args:
         machine: Nominal machine.
@@ -122,7 +124,7 @@ class Shield:
         return command
 
     def _lack(self, corners: FloatArray) -> FloatArray:
-        """Return the conditioning (r,) that the path with corners (r, 3, 3) m, c, d lacks."""
+        """Return the conditioning (r,) that paths lack; their corners m, c, d are (r, 3, 3)."""
         return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
@@ -180,12 +182,12 @@ class Shield:
 
 
 class BrakingShield:
-    """Replacement of commands after which robots could not brake in time, for n robots.
+    """Shield of Cycle: replaces commands after which robots could not brake in time.
 
     A command is safe if the conditioning stays at ``least`` or above on its path, and while the
     robot brakes after it as hard as the follower allows. No torque may exceed the motors' peak. So
     it is always safe to brake, because the rest of the last braking is safe. An unsafe command is
-    moved towards the command of braking, in a straight line.
+    moved in a straight line towards the command with which the robot brakes.
 
     Args:
         machine: Nominal machine.
@@ -225,7 +227,7 @@ class BrakingShield:
         return command
 
     def _lowest(self, command: FloatArray, recent: FloatArray) -> FloatArray:
-        """Return the smallest conditioning (r,) until robots that get a command and brake rest."""
+        """Return the smallest conditioning (r,) if robots get a command and then brake to rest."""
         found: FloatArray = np.full(len(command), np.inf)
         rows, (before, current), then = np.arange(len(command)), recent.swapaxes(0, 1), command
         for _ in range(_LONGEST):
@@ -277,7 +279,7 @@ def make_shield(
 
 
 def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
-    """Return the smallest conditioning (r,) on paths with the corners (r, 3, 3) m, c, d."""
+    """Return the smallest conditioning (r,) on paths; their corners m, c, d are (r, 3, 3)."""
     points = loops().spline_points(corners, _nodes())
     found: FloatArray = lowest(machine.conditioning_at(points))
     return found

@@ -53,7 +53,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | Stack | 4 | 33 | 6 | 100 | put the first block on the goal and the second on it |
     | Throw | 4 | 21 | 3 | 60 | let the block go in flight; it slides to the goal |
     | Conveyor | 4 | 22 | 3 | 80 | bring the block from the belt to the tray |
-    | Cycle | 3 | 9 | 3 | 75 | carry a payload 25 mm up, 305 mm across, 25 mm down, soon |
+    | Cycle | 3 | 9 | 3 | 75 | carry a payload 25 mm up, 305 mm across, 25 mm down, fast |
     | Crossing | 3 | 9 | 3 | 50 | pass the parallel singularity; Cartesian increments only |
 
     A control step takes 40 ms. Episodes are truncated, never terminated. The numbers below apply
@@ -118,7 +118,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | goal, dense | minus the distance in units of 0.1 m; Cycle: more near the goal |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
-    | gate | minus the depth of P below the way over the gate, in units of 5 mm |
+    | gate | minus the depth of P below the gate, in units of 5 mm |
 
     SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
     alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` keeps the other terms; so does SB3's buffer

@@ -86,7 +86,7 @@ class EvaluationConfig:
     """Episodes of the video."""
 
     picture: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """PNG of six moments of the first episode; several policies get a file each."""
+    """PNG of six different moments of the first episode; several policies get a file each."""
 
     camera: Literal["table", "overview", "cup"] = "table"
     """Camera of video and picture: the task region, the whole robot, or close to the cup."""
@@ -289,10 +289,10 @@ def _film(config: EvaluationConfig, console: Console) -> None:
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
         policies = _load(config, envs)
-        write_film = partial(write_video, fps=envs.metadata["render_fps"])
+        fps = envs.metadata["render_fps"]
         films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
-            ("video", config.video, count, write_film),
-            ("picture", config.picture, 1, write_contact_sheet),
+            ("video", config.video, count, partial(write_video, fps=fps)),
+            ("picture", config.picture, 1, partial(write_contact_sheet, fps=fps)),
         )
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []

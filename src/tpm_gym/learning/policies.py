@@ -64,7 +64,7 @@ class RandomPolicy:
 
 
 class ExpertPolicy(Expert):
-    """Policy that acts with the scripted controller, which is deterministic."""
+    """Policy of the expert, which is deterministic."""
 
     def reset(self, observation: Observation, seeds: Sequence[int] = ()) -> None:
         """Plan the motion of the episodes."""

@@ -58,9 +58,9 @@ class Recipe:
         """Return keyword arguments of the algorithm's constructor, with classes for names.
 
         Args:
-            update: Share of the training that lies between two updates. A learning rate that falls
-                to zero reaches zero that much after the last update. With 0, as in
-                Stable-Baselines3, the last update has a rate of zero and teaches nothing.
+            update: Part of the training between two updates, from 0 to 1. A learning rate that
+                falls to zero is zero one such part after the last update. With 0, as in
+                Stable-Baselines3, the rate is zero in the last update, which changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):

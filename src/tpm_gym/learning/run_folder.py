@@ -179,7 +179,7 @@ def claimed(run: Path) -> Iterator[None]:
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
     """Convert errors of a full or broken disk to a RunError that says how to continue.
 
-    So are the errors of a pipe to a process that has ended.
+    Errors of a pipe to a process that has ended are converted, too.
     """
     try:
         yield

@@ -287,7 +287,7 @@ class _Session:
             self._test()
 
     def complete(self) -> bool:
-        """Make what a kill after the last step left out; return whether the test was."""
+        """Make curve and last test if a kill prevented them; return whether the test was made."""
         config = self.config
         if not (config.run / CURVE_FILE).exists():
             evaluations = run_folder.evaluations(config.run)

@@ -76,7 +76,7 @@ class TuneConfig:
     """Steps of each training."""
 
     jobs: Annotated[int, unset(int, "one for each core", "INT")] = UNSET
-    """Trainings at a time, on this machine or on the Ray cluster that RAY_ADDRESS names."""
+    """Trainings at a time, on this computer or on the Ray cluster that RAY_ADDRESS names."""
 
     seed: int = 0
     """Seed of the search; training i has this seed + i."""
@@ -154,7 +154,7 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
 
 @contextmanager
 def _started(ray: Any, jobs: int | None) -> Iterator[None]:
-    """Start Ray on this machine, or join the cluster at RAY_ADDRESS, if that is not done yet."""
+    """Start Ray on this computer, or join the cluster at RAY_ADDRESS, unless that is done."""
     if ray.is_initialized():
         yield
         return

@@ -22,7 +22,7 @@ from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
 ASSEMBLY_LIMIT = 0.010
-"""Largest distance between platform and forward kinematics in the same assembly mode, m."""
+"""Distance of P from the forward kinematics above which the assembly mode is another one, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class CompiledMachine(Machine):
     @cached_property
     @abstractmethod
     def _constants(self) -> FloatArray:
-        """Signs of the modes, and gravity: what all machines as built share."""
+        """Constants that are equal for all robots: signs of the modes, and gravity."""
 
     def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""

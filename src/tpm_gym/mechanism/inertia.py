@@ -58,10 +58,10 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
 
 
 class Bodies:
-    """Moving links with their factors, by name; keeps the names of the links that were used."""
+    """Moving links by name, with factors of their masses; remembers which links were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Set the factors of mass and inertia, one for each moving link; empty if all are 1.
+        """Set factors of mass and inertia, one for each moving link; none if all are 1.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.
@@ -96,7 +96,7 @@ class Bodies:
         return self.mass(name), self.moment(name, axis)
 
     def bar(self, name: str, along: int, about: int, length: float) -> FloatArray:
-        """Compute a, b and c of a bar that turns in a plane, about an axis across the bar."""
+        """Compute a, b, c (see the module) of a bar that turns in a plane, about axis ``about``."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k not in (along, about)])
         share = float(self._link(name).centre_of_mass[along]) / length
         mass, turning = self.mass(name), self.moment(name, about) / length**2
@@ -104,7 +104,7 @@ class Bodies:
         return np.array([near, mass * share * (1 - share) - turning, far])
 
     def round_bar(self, name: str, along: int, length: float) -> FloatArray:
-        """Compute a, b and c of a bar that turns in space, and so must be round."""
+        """Compute a, b, c (see the module) of a bar that turns in space; it must be round."""
         one, other = (k for k in (X, Y, Z) if k != along)
         self._require_on_axis(name, [one, other])
         moments = self._link(name).inertia

@@ -50,7 +50,7 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
     Args:
         mechanism: Robot.
         mount: Mount of the robot.
-        time_step: Time step, s; the loops close within one.
+        time_step: Time step, s, within which the constraints close the loops.
     """
     root = Element("mujoco", model=mechanism.name)
     add(root, "compiler", angle="radian", autolimits="true")

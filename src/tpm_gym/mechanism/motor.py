@@ -61,7 +61,7 @@ class Motor:
 
     @property
     def reach(self) -> float:
-        """Distance from the middle to the far end of each housing, m."""
+        """Distance from the middle of the motor to the far end of each half, m."""
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
     def rotor(self, axis: Axis) -> list[Solid]:

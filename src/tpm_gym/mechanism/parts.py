@@ -70,7 +70,7 @@ def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 def motor(
     name: str, axis: Vector, origin: Vector, level: float, sense: int, rpy: Vector = LEVEL
 ) -> Joint:
-    """Build a motor. At theta = ``level`` its arm points outwards; ``sense`` of theta lowers it."""
+    """Build a motor. Its arm points outwards at theta = ``level``, and ``sense`` is downwards."""
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
     line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
     return Joint(name, "revolute", "base", origin, axis, lower, upper, *line, rpy)

@@ -21,7 +21,7 @@ _BLOCK = 8
 """Rows of a batch that are multiplied at once.
 
 OpenBLAS uses no threads for so few rows. So an action has the same bits alone and in a batch, and
-threads do not slow each other down on a busy machine.
+threads do not slow each other down on a busy computer.
 """
 
 
@@ -29,13 +29,13 @@ def load_policy(path: str | Path) -> Policy:
     """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. If neither
-            does, also the id of an environment with a published policy, a str such as
-            ``"TPMPickAndPlace-v0"``.
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. Or the id of
+            an environment with a published policy, such as ``"TPMPickAndPlace-v0"``, if neither
+            file exists.
 
     Raises:
         InputError: ``path`` is neither a str nor a Path, or empty.
-        PolicyFileError: A file is missing or no policy file, or ``path`` is an archive of
+        PolicyFileError: A file is missing or is not that of a policy, or ``path`` is an archive of
             Stable-Baselines3, which only unpickling could read.
         MissingPackageError: safetensors or pydantic is not installed.
     """

@@ -38,7 +38,15 @@ def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
 def shifted(
     points: FloatArray, parts: FloatArray, step: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return points (m, 3) moved by ``parts`` (m, 3) of a step (3,), and projected into a box."""
+    """Return points + parts * step, projected into the box from ``low`` to ``high``.
+
+    Args:
+        points: (m, 3).
+        parts: (m, 3).
+        step: (3,).
+        low: (3,).
+        high: (3,).
+    """
     moved = np.empty_like(points)
     for row in range(len(points)):
         for axis in range(3):
@@ -239,7 +247,8 @@ def truth(
     """Compute the largest loop gap (m), point P (m, world) and the platform's tilt (rad).
 
     Args:
-        frames: (7 l,) origin (m) and orientation (x, y, z, w) of each of l links, world.
+        frames: (7 l,) seven numbers for each of l links, world frame: origin (m), orientation
+            (x, y, z, w).
         sides: (c, 2) indices of the two links of each closure.
         pivots: (c, 2, 3) m, points of each closure, in the frames of its links.
         platform: Index of the platform's link.
@@ -333,13 +342,13 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
 
 @kept
 def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray:
-    """Return points (r, k, d, 3) in boxes, from random numbers.
+    """Return d candidates for each of k points of r environments, (r, k, d, 3), in boxes.
 
     Args:
-        shares: (r, k, d, 4) numbers in [0, 1): the place in the box, and which box. All d points
-            are in the box of the first.
-        boxes: (b, 2, 3) low and high corners; those of the first of k points come first.
-        counts: (k,) number of boxes of each of the k points.
+        shares: (r, k, d, 4) random numbers in [0, 1). The first three are the place in a box. The
+            fourth chooses the box; all d candidates are in the box that the first one chooses.
+        boxes: (b, 2, 3) low and high corners: all boxes of the first point, then of the second.
+        counts: (k,) number of boxes of each point.
     """
     points = np.empty((*shares.shape[:3], 3))
     for row in range(len(shares)):
@@ -370,8 +379,8 @@ def accepted(
         drawn: (r, k, d, 3) m, draws for the last k points of each row.
         conditioning: (r, k, d), at the draws.
         least: Smallest conditioning.
-        most: Conditioning above all that are accepted.
-        apart: Smallest distance from all points before, m.
+        most: Bound of the conditioning; accepted draws are below it.
+        apart: Smallest distance from the points before, m.
         rows: (r,) rows of ``points``.
         points: (n, j, 3) m; output.
 

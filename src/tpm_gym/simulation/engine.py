@@ -299,7 +299,7 @@ class Engine(Protocol):
         """
 
     def restore(self, saved: Any) -> None:
-        """Continue from the result of ``save``; number of robots and plants must be equal."""
+        """Continue from what ``save`` returned, with as many robots and the same plants as then."""
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Update the window: its camera, the first robot, and the goal markers, (k, 3) m.

@@ -133,7 +133,7 @@ def _named(name: str, machine: Machine) -> Camera:
 
 
 class View(NamedTuple):
-    """Picture that an engine shall draw.
+    """Request for a picture.
 
     Attributes:
         camera: Camera, in the world frame.

@@ -70,7 +70,7 @@ class Simulation:
         count: Number of robots, n.
         control_period: Time between two commands, s.
         physics: Numerical settings of the engine; None for the engine's defaults. A control period
-            other than 40 ms has ten time steps if the settings do not say.
+            other than 40 ms has ten time steps, unless the settings have a time step.
         drive: Servo drives of the motors; None for ideal drives.
         gui: Whether to open a window.
         renderer: Renderer of the pictures; None for the engine's default.
@@ -257,7 +257,7 @@ class Simulation:
         return self._mode_left
 
     def state(self) -> State:
-        """Return the state of all robots; after a move or reset, read the engine once.
+        """Return the state of all robots. The engine is read once after each move or reset.
 
         Raises:
             ClosureError: If a loop has opened.

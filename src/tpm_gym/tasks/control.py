@@ -46,7 +46,7 @@ class Control(Protocol):
         """Return the number of control steps between two points (3,) m at the highest speed."""
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Return the places (n, 3) of points (n, 3) m, whose differences are actions."""
+        """Return points (n, 3) m in units of actions, (n, 3): differences are actions."""
 
     def rate(self, points: FloatArray) -> FloatArray:
         """Return the motion of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
@@ -140,9 +140,9 @@ class JointControl:
     ) -> FloatArray:
         """Shorten the increment until P moves by the limit, to a thousandth; return P (r, 3) m.
 
-        The secant through two tries gives the next one. Division alone converges slowly next to the
-        serial singularity, where P slows down along the way. P stays where it is if no try is
-        within the limit, next to a parallel singularity.
+        The secant through two tries gives the next try. (Dividing by the excess alone converges
+        slowly next to the serial singularity, where P slows down along the way.) Next to a parallel
+        singularity no try may be within the limit; P stays where it is then.
         """
         point, low, high = current, np.zeros_like(share), share
         before, was = np.zeros_like(share), np.zeros_like(share)

@@ -40,7 +40,8 @@ SHARES: Final = (0.65, 0.1, 0.65)
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
-Along x the way ends close to the region, along z far from it. Both together have to be possible.
+Along x the way ends close to the end of the region, along z far from it. The motors must be able
+to brake along both at a time.
 """
 NEAR: Final = 0.010
 """Distance to the end from which on a dense reward costs 1 more, m."""
@@ -186,7 +187,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Subtract the distance, up to 10 mm, in units of 10 mm from a dense reward as well."""
+        """Add to a dense reward minus the distance up to 10 mm, in units of 10 mm."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 

@@ -1,4 +1,4 @@
-"""The scripted controller of all tasks, on closed-form kinematics.
+"""The expert: the scripted controller of all tasks, on closed-form kinematics.
 
 The expert gets the same observation as a policy. For each robot it follows the task's plan, which
 moves point P with trapezoidal speed, and converts each command into an action of the environment's

@@ -95,7 +95,9 @@ class Push(Task):
         return fits
 
     def behind(self, place: FloatArray, way: FloatArray, gap: float) -> FloatArray:
-        """Return P (..., 3) m, world, with the lip low behind blocks that shall move along ``way``.
+        """Return places of P from which the lip can push blocks along ``way``, (..., 3) m, world.
+
+        The lip is behind the block there, and P as low as the region allows.
 
         Args:
             place: Centres (..., 3) m of the blocks.

@@ -102,7 +102,7 @@ def safe_draw(
     draw: Callable[[np.random.Generator], FloatArray],
     ways: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Draw points until the way that belongs to one is safe, and return that point (3,).
+    """Draw points until one has a safe way; return this point, (3,).
 
     Args:
         rng: Generator of the row.
@@ -127,7 +127,7 @@ def safe_draw(
 
 
 def _limits(machine: Machine, near_singularity: bool) -> tuple[float, float]:
-    """Return the lowest conditioning of points, and the one below which it lies."""
+    """Return the limits of the conditioning of points: the lowest value, and an upper bound."""
     safe = machine.safe_conditioning
     return safe, safe + BAND if near_singularity else math.inf
 

@@ -150,7 +150,7 @@ class Explore:
 
     @property
     def text(self) -> str:
-        """The reason in the panel, as HTML."""
+        """The message in the panel why there is no such posture, as HTML; empty if there is one."""
         return str(self._refusal.content)
 
     def _attempt(self, solve: Callable[[], Posture]) -> None:

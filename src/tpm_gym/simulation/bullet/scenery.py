@@ -112,7 +112,8 @@ class Scenery:
     def run_belts(self) -> None:
         """Set place and velocity of the belts; call before each time step.
 
-        Contacts see the velocity of a static body's base. But Bullet moves the body, too.
+        A belt is a static body with a velocity, so that contacts carry blocks along. Bullet also
+        moves the body by this velocity; therefore the place is set each time.
         """
         for belt, place in zip(self.belts, self._belt_places, strict=True):
             self._client.resetBasePositionAndOrientation(belt, *place)

@@ -93,11 +93,12 @@ class Kind:
 
     Attributes:
         machine: The machine.
-        lists: Labels and explanations of lists in the panel: first operation mode, last assembly
-            mode; those between, at most two, choose the working mode.
-        working: Working modes by the words chosen in these lists.
+        lists: Labels of the lists in the panel, with an explanation each. The first list chooses
+            the operation mode, the last one the assembly mode. Lists between, at most two, choose
+            the working mode.
+        working: Working modes by the entries chosen in the lists between.
         assembly: Assembly modes by operation mode and label.
-        lows: Lower ends of the sliders of three motors, degrees. A slide has its stops.
+        lows: Lower ends of the sliders of three motors, degrees. Those of a slide are its stops.
     """
 
     lists: Mapping[str, str] = {"Operation": "Operation mode", "Assembly": "Assembly mode"}

@@ -148,7 +148,7 @@ class TPMKind(Kind):
             return working, lambda: {name: surface(name, working, g) for name in factors}
 
         def found_aspects() -> list[Cells]:
-            """Find those on the side of P; those beyond y = 0 are their mirror images."""
+            """Find the aspects on P's side of y = 0; the others are their mirror images."""
             return [a.cells for a in aspects(working, g) if a.assembly.sin_beta == side]
 
         def quality(points: FloatArray) -> FloatArray:

@@ -88,7 +88,8 @@ class Setting(NamedTuple):
         table: Lowest and highest x of table and belt, and half their width, m.
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
-        turn, origin: Factors, and origin (m), that convert the machine's frame to the world frame.
+        turn: Signs of the axes, from the machine's frame to the world frame.
+        origin: Place of the machine's origin in the world, m.
     """
 
     half: FloatArray
