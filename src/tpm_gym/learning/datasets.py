@@ -117,6 +117,10 @@ class Dataset:
         given = {"engine": own, **self.config.env_options.given()}
         if given["engine"] == "analytic":  # the command's default
             del given["engine"]
+        if given.get("shield") is False:  # the id's default
+            del given["shield"]
+        if given.get("shield", True) is not True:
+            given["shield"] = f"shield{given['shield']}".replace(".", "_")  # Minari has no dots
         options = [value if isinstance(value, str) else key for key, value in given.items()]
         words = "-".join(filter(None, (self.kind, *options)))
         return f"{self.env.rpartition(':')[2]}/{words}-v0"

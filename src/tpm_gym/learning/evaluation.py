@@ -183,7 +183,8 @@ def _common(option: str, values: Mapping[str, Any]) -> Any:
     found = set(values.values())
     if len(found) > 1:
         each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
-        raise ConfigError(f"policies differ in {option}: {each}; choose one with --{option}")
+        example = f"--{option} {next(iter(values.values()))}"
+        raise ConfigError(f"policies differ in {option}: {each}; choose one, as in {example}")
     return found.pop()
 
 
@@ -191,7 +192,7 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of machine, engine and drive, by default the id's, and a shield, if any."""
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     if given.get("shield"):
-        usual["shield"] = "True"
+        usual["shield"] = ""
     own = check_env_id(env_id).kwargs
     found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
     return {name: str(getattr(value, "name", value)) for name, value in found.items()}

@@ -190,8 +190,7 @@ def _train(
     _write(recipe, base, changes)
     options = {"algo": base.algo, "env": base.env, "steps": base.steps, "seed": seed + number}
     options |= {"recipe": recipe, "run": run, "test-episodes": 0, **base.env_options.given()}
-    flags = [f"--{key}" for key, value in options.items() if value is True]
-    words = [f"--{key}={value}" for key, value in options.items() if value is not True] + flags
+    words = [f"--{key}={value}" for key, value in options.items()]
     words += ["--randomisation", *base.randomisation] if base.randomisation else []
     # In a process of its own: Ray Tune calls this in a thread, which cannot receive signals.
     with log.open("w", encoding="utf-8") as file:
