@@ -244,7 +244,7 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"recipe_file": Path("none.yml"), "envs": 0}, "--envs 0: must be at least 1"),
         ({"randomisation": ("block_mass",)}, "--randomisation block_mass: must be KEY=NUMBER"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
-        ({"envs": 5}, "learning_starts: 100 is less than the 250 steps"),
+        ({"envs": 5}, "learning_starts: 100 is less than the 250 steps .* at most --envs 2"),
         ({"envs": 1001}, r"--envs 1001 \(n_envs of the recipe, .*at most 1,000"),
         ({"envs": 10**8, "env_options": EnvOptions(engine="analytic")}, "at most 1,000,000"),
         ({"steps": 1}, r"--steps 1: one rollout takes 2 \(1 environments x train_freq\)"),

@@ -105,6 +105,12 @@ class EnvOptions:
         return {name: value for name, value in vars(self).items() if value is not UNSET}
 
 
+GivenEnvOptions = Annotated[
+    tyro.conf.OmitArgPrefixes[EnvOptions], tyro.conf.arg(name="environment")
+]
+"""Options of an environment in a group of their own in the help."""
+
+
 @dataclass(frozen=True)
 class TrainingConfig:
     """Train a policy. Everything about the run goes to one folder."""
@@ -145,7 +151,7 @@ class TrainingConfig:
     goals: Literal["sampled", "tempting"] = "sampled"
     """Goals: sampled everywhere, or only next to the singularity (tempting)."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
@@ -382,10 +388,12 @@ def _check_recipe(config: TrainingConfig) -> None:
         )
     if config.recipe.hindsight:  # it draws from whole episodes
         for name in ("learning_starts", "buffer_size"):
+            few, most = config.argument(name), config.argument(name) * envs // config.horizon
+            fewer = f", or give at most --envs {most}" if most else ""
             _refuse(
-                config.argument(name) < config.horizon,
-                f"{where}: {name}: {config.argument(name)} is less than the {config.horizon} steps "
-                f"of an episode in each of {envs} environments; raise it, or use fewer --envs",
+                few < config.horizon,
+                f"{where}: {name}: {few} is less than the {config.horizon} steps of an episode in "
+                f"each of {envs} environments; raise it in a --recipe of yours{fewer}",
             )
 
 

@@ -19,6 +19,7 @@ from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import (
     UNSET,
     EnvOptions,
+    GivenEnvOptions,
     Randomised,
     check_least,
     parse_randomisation,
@@ -71,7 +72,7 @@ class EvaluationConfig:
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
@@ -298,9 +299,9 @@ def _film(config: EvaluationConfig, console: Console) -> None:
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
-                console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
                 with bar(console, kind, episodes * frames) as advance:
                     write(path, partial(_play, envs, policy, episodes, config.seed, advance))
+                console.print(f"{kind}: {path}", markup=False)
 
 
 def _play(

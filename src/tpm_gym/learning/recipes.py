@@ -157,7 +157,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
         name = known
         recipes[name].pop("demonstrations", None)
     if name not in recipes:
-        elsewhere = "".join(f"; {options} has one" for options in shipped_for(name))
+        elsewhere = "".join(f"; {options} has one" for options in shipped_for(name)[:1])
         there = f"it has {', '.join(recipes) or 'none'}{elsewhere}"
         own = "a file of yours with one is --recipe FILE"
         raise ConfigError(f"{path}: no recipe of {algorithm} for {name}; {there}; {own}")

@@ -247,6 +247,8 @@ class _Session:
         start = f"from step {content.step if content else 0:,} to "
         start = start if "resumed" in self.description else ""
         _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
+        count, every = config.eval_episodes, config.eval_every
+        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
         iterations = max(0, model.num_timesteps - config.demonstrated) // config.rollout
         model.set_logger(training_state.make_logger(config.run, content, iterations))
         return seconds, evaluations
@@ -318,7 +320,12 @@ class _Session:
     def _test(self) -> None:
         """Test the best policy in the analytic engine and in PyBullet; print success and events."""
         config = self.config
-        _say(self.console, f"testing {config.test_episodes} held-out episodes in each engine ...")
+        best = max(run_folder.evaluations(config.run), key=callbacks.quality)["steps"]
+        _say(
+            self.console,
+            f"testing the best policy, of step {best:,}, in {config.test_episodes} held-out "
+            "episodes in each engine ...",
+        )
         rates: dict[str, list[str]] = {}
         for engine in _TESTED:
             test = EvaluationConfig(
