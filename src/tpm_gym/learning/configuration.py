@@ -165,7 +165,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the last test of a policy from --engine analytic, there and in PyBullet."""
+    """Episodes of the last test of a policy from --engine analytic, there and in PyBullet; 0 for
+    none."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By time: every 30 s, for at most 2% of the time."""

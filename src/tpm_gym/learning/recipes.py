@@ -104,7 +104,7 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 
 
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
-    """Return an algorithm with a recipe for an id, or else with one that the id may use.
+    """Return the first algorithm by name with a recipe for an id, or else with one that it may use.
 
     Args:
         env_id: ``id`` or ``module:id``.
@@ -113,7 +113,7 @@ def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = No
     """
     found = {}
     for algorithm in sorted(ALGORITHMS):
-        with suppress(ConfigError):  # reported by who reads the recipe
+        with suppress(ConfigError):  # complete() reports it for the chosen one
             recipe = read_recipe(path or recipe_file(algorithm, engine), algorithm, env_id)
             found[algorithm] = recipe.written_for
     own = [algorithm for algorithm, name in found.items() if name == env_id.rpartition(":")[2]]
