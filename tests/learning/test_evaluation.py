@@ -123,7 +123,7 @@ def test_video_shows_the_first_episodes(short, tmp_path):
     assert (frames[0] != frames[-1]).any()  # and it moves
     assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 25
     assert [entry.name for entry in path.parent.iterdir()] == ["expert.mp4"]
-    assert f"video: {path}, 7 frames ..." in said(console)
+    assert f"video: {path}\n" in said(console)
 
 
 @pytest.mark.parametrize(
@@ -185,7 +185,7 @@ def test_picture_shows_the_motion_at_the_start_of_a_long_episode(tmp_path):
         (
             {"env": None, "policy": ("TPMReach-v0", "TPMPickAndPlace-v0")},
             ConfigError,
-            "differ in env: TPMReach-v0 .*, TPMPickAndPlace-v0 .*; choose one with --env",
+            "differ in env: TPMReach-v0 .*, TPMPickAndPlace-v0 .*; choose one, as in --env TPMR",
         ),
         ({"env": "TPMRech-v0"}, ConfigError, "TPMReach-v0"),
         ({"policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
@@ -277,6 +277,31 @@ def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_gi
         evaluate(EvaluationConfig(both, episodes=1), quiet())
     chosen = EnvOptions("paper", drive="ideal")
     evaluate(EvaluationConfig(both, episodes=1, env_options=chosen), quiet())
+
+
+@pytest.mark.parametrize(
+    ("trained", "words", "expected"),
+    [
+        (True, [], "True"),
+        (0.1, [], "0.1"),
+        (True, ["--shield", "False"], None),
+        (True, ["--shield", "0.104"], "0.104"),
+        (False, ["--shield"], "True"),
+        (False, [], None),
+    ],
+)
+def test_the_shield_is_the_policys_unless_another_is_given(trained, words, expected, run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    path, out = tmp_path / "run" / "best.json", tmp_path / "out.json"
+    content = json.loads(path.read_text()) | {"env_options": {"shield": trained}}
+    path.write_text(json.dumps({**content, "sha256": digest(content)}))
+    words = [*words, "--engine", "analytic", "--episodes", "1", "--json", str(out)]
+    main(["evaluate", *words, "--policy", str(path)])
+    assert read_strict(out)["env_options"].get("shield") == expected
+    if trained is True and not expected:
+        both = (str(path), "TPMReach-v0")
+        with pytest.raises(ConfigError, match=r"in shield: True .*, False .*, as in --shield True"):
+            evaluate(EvaluationConfig(both, episodes=1), quiet())
 
 
 def test_an_exported_policy_goes_by_any_of_its_names(run):

@@ -47,7 +47,7 @@ class Subspace:
         rows = numbers("vectors", vectors)
         rows = finite_points("vectors", rows if rows.size else rows.reshape(0, 3))
         if rows.ndim != 2:
-            raise InputError("vectors", rows.shape, "an array of shape (n, 3), by shape")
+            raise InputError("shape of vectors", rows.shape, "(n, 3)")
         lengths = np.linalg.norm(rows, axis=1)
         rows = rows[lengths > _SAME] / lengths[lengths > _SAME, None]
         _, values, right = np.linalg.svd(rows)

@@ -516,5 +516,5 @@ def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
     except ValueError:
         fit = False
     if not fit:
-        valid = f"of shapes (..., {size}) that go together, by shape"
+        valid = f"of shapes (..., {size}) that go together"
         raise InputError("achieved_goal, desired_goal", shapes, valid)

@@ -68,9 +68,9 @@ class PeriodicEvaluation(BaseCallback):
     def _evaluate(self) -> None:
         policy, episodes = TrainedPolicy(self.model), self.config.eval_episodes
         metrics = summarise(run_episodes(self.envs, policy, episodes, SELECTION_SEED))
-        earlier = max(map(_quality, self.evaluations), default=None)
+        earlier = max(map(quality, self.evaluations), default=None)
         self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
-        best = earlier is None or _quality(self.evaluations[-1]) > earlier
+        best = earlier is None or quality(self.evaluations[-1]) > earlier
         if best:
             self.keep(self.model)
         success = metrics["success_at_end"]
@@ -99,7 +99,8 @@ class PeriodicEvaluation(BaseCallback):
         self.logger.dump(self.num_timesteps)
 
 
-def _quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
+def quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
+    """Return success and return of an evaluation: the best policy has the highest."""
     return evaluation["success_at_end"]["mean"], evaluation["return"]["mean"]
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import importlib.util
 import json
 import math
 import tempfile
@@ -27,9 +26,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 import tpm_gym
-from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning import provenance
-from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, unset
+from tpm_gym.learning.configuration import (
+    UNSET,
+    EnvOptions,
+    GivenEnvOptions,
+    check_least,
+    unset,
+)
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.evaluation import bar
@@ -96,9 +100,7 @@ class CollectConfig:
     overwrite: bool = False
     """Replace datasets of this command that are there already."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(
-        default_factory=lambda: EnvOptions(engine="analytic")
-    )
+    env_options: GivenEnvOptions = field(default_factory=lambda: EnvOptions(engine="analytic"))
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,10 @@ class Dataset:
         given = {"engine": own, **self.config.env_options.given()}
         if given["engine"] == "analytic":  # the command's default
             del given["engine"]
+        if given.get("shield") is False:  # the id's default
+            del given["shield"]
+        if given.get("shield", True) is not True:
+            given["shield"] = f"shield{given['shield']}".replace(".", "_")  # Minari has no dots
         options = [value if isinstance(value, str) else key for key, value in given.items()]
         words = "-".join(filter(None, (self.kind, *options)))
         return f"{self.env.rpartition(':')[2]}/{words}-v0"
@@ -159,9 +165,7 @@ def _require_packages(kinds: Sequence[str]) -> None:
     extras = {"minari": "data", "h5py": "data"}
     if "replay" in kinds:
         extras |= {"torch": "train", "stable_baselines3": "train"}
-    for package, extra in extras.items():
-        if importlib.util.find_spec(package) is None:
-            raise MissingPackageError(package, extra)
+    provenance.require_packages(extras)
 
 
 def _complete(config: CollectConfig) -> list[str]:

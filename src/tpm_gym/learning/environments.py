@@ -50,6 +50,9 @@ def check_env_id(env_id: str) -> EnvSpec:
         spec = gym.spec(name if module else env_id)
     except (gym.error.Error, ValueError) as error:  # ValueError: ":" with no module before it
         there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
+        if module:
+            file = getattr(sys.modules[module], "__file__", None) or "a part of Python"
+            there = f"the module is {file}; if you mean another file, give it another name"
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
     entry: Any = spec.entry_point
     if isinstance(entry, str):

@@ -19,6 +19,7 @@ from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import (
     UNSET,
     EnvOptions,
+    GivenEnvOptions,
     Randomised,
     check_least,
     parse_randomisation,
@@ -71,7 +72,7 @@ class EvaluationConfig:
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
@@ -183,7 +184,8 @@ def _common(option: str, values: Mapping[str, Any]) -> Any:
     found = set(values.values())
     if len(found) > 1:
         each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
-        raise ConfigError(f"policies differ in {option}: {each}; choose one with --{option}")
+        example = f"--{option} {next(iter(values.values()))}"
+        raise ConfigError(f"policies differ in {option}: {each}; choose one, as in {example}")
     return found.pop()
 
 
@@ -191,7 +193,7 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of machine, engine and drive, by default the id's, and a shield, if any."""
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     if given.get("shield"):
-        usual["shield"] = "True"
+        usual["shield"] = ""
     own = check_env_id(env_id).kwargs
     found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
     return {name: str(getattr(value, "name", value)) for name, value in found.items()}
@@ -297,9 +299,9 @@ def _film(config: EvaluationConfig, console: Console) -> None:
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
-                console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
                 with bar(console, kind, episodes * frames) as advance:
                     write(path, partial(_play, envs, policy, episodes, config.seed, advance))
+                console.print(f"{kind}: {path}", markup=False)
 
 
 def _play(

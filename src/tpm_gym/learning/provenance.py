@@ -11,9 +11,11 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning.errors import ConfigError
 
 _PACKAGES: Final = (
@@ -89,6 +91,13 @@ def _portable(word: str) -> str:
         return word
     inside = path.is_relative_to(Path.cwd())
     return f"{option}{equals}{path.relative_to(Path.cwd()) if inside else path.name}"
+
+
+def require_packages(extras: Mapping[str, str]) -> None:
+    """Refuse to start without a package that is needed later; ``extras`` install the packages."""
+    for package, extra in extras.items():
+        if find_spec(package) is None:
+            raise MissingPackageError(package, extra)
 
 
 def require_writable(option: str, path: Path) -> None:

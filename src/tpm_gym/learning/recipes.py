@@ -10,6 +10,7 @@ several algorithms has such a mapping under the name of each: ``ppo``, ``sac``, 
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -102,6 +103,33 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
     return own if own.is_file() else RECIPES / f"{algorithm}.yml"
 
 
+def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
+    """Return the first algorithm by name with a recipe for an id, or else with one that it may use.
+
+    Args:
+        env_id: ``id`` or ``module:id``.
+        engine: Engine to train in.
+        path: File of the recipes; None for the shipped ones.
+    """
+    found = {}
+    for algorithm in sorted(ALGORITHMS):
+        with suppress(ConfigError):  # complete() reports it for the chosen one
+            recipe = read_recipe(path or recipe_file(algorithm, engine), algorithm, env_id)
+            found[algorithm] = recipe.written_for
+    own = [algorithm for algorithm, name in found.items() if name == env_id.rpartition(":")[2]]
+    return next(iter([*own, *found]), "sac")
+
+
+def shipped_for(env_id: str) -> list[str]:
+    """Return options of a training with which there is a shipped recipe for an id."""
+    found = []
+    for file in sorted(RECIPES.glob("*.yml"), key=lambda file: file.stem):
+        algorithm, _, engine = file.stem.partition("-")
+        if env_id.rpartition(":")[2] in read_recipes(file, algorithm):
+            found.append(f"--algo {algorithm}" + (f" --engine {engine}" if engine else ""))
+    return found
+
+
 def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
     """Return entries of a recipe with classes in place of their names."""
     found = dict(entries)
@@ -129,12 +157,8 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
         name = known
         recipes[name].pop("demonstrations", None)
     if name not in recipes:
-        elsewhere = [
-            f"; --engine {file.stem.partition('-')[2]} has one"
-            for file in RECIPES.glob(f"{algorithm}-*.yml")
-            if name in read_recipes(file, algorithm)
-        ]
-        there = f"it has {', '.join(recipes) or 'none'}{''.join(elsewhere)}"
+        elsewhere = "".join(f"; {options} has one" for options in shipped_for(name)[:1])
+        there = f"it has {', '.join(recipes) or 'none'}{elsewhere}"
         own = "a file of yours with one is --recipe FILE"
         raise ConfigError(f"{path}: no recipe of {algorithm} for {name}; {there}; {own}")
     arguments = dict(recipes[name])

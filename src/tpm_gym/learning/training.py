@@ -39,6 +39,7 @@ from tpm_gym.learning.errors import (
     RunError,
 )
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.recipes import shipped_for
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import (
     CHECKPOINTS,
@@ -80,15 +81,27 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     asked = config.recipe.n_timesteps if asked is UNSET else asked
     _require_room(config, size)
     run_folder.prepare(config.run, config.overwrite)
-    if config.steps != asked:
+    if config.demonstrations != (few := config.recipe.demonstrations.get("episodes", 0)):
         _say(
             console,
-            f"note: {asked:,} steps were asked for, and rounded up to whole rollouts of "
-            f"{config.rollout:,} steps",
+            f"note: {few:,} demonstrations were asked for, and rounded up to "
+            f"{config.demonstrations:,}, equally many in each of {config.envs:,} environments",
+        )
+    if config.steps != asked:
+        shown = f"{config.demonstrated:,} of demonstrations and " if config.demonstrated else ""
+        rollouts = (config.steps - config.demonstrated) // config.rollout
+        _say(
+            console,
+            f"note: {asked:,} steps were asked for, and rounded up to {config.steps:,}: {shown}"
+            f"{rollouts:,} rollouts of {config.rollout:,}",
         )
     if config.recipe.written_for != config.env.rpartition(":")[2]:
-        other = config.recipe.written_for
-        _say(console, f"note: the recipe is that of {other}; give your own with --recipe FILE")
+        there = "".join(f"; the id has one with {own}" for own in shipped_for(config.env)[:1])
+        _say(
+            console,
+            f"note: the recipe of {config.algo} is that of {config.recipe.written_for}{there}; "
+            "give your own with --recipe FILE",
+        )
     starts = config.argument("learning_starts") or 0
     if config.steps <= starts:
         _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
@@ -234,6 +247,8 @@ class _Session:
         start = f"from step {content.step if content else 0:,} to "
         start = start if "resumed" in self.description else ""
         _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
+        count, every = config.eval_episodes, config.eval_every
+        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
         iterations = max(0, model.num_timesteps - config.demonstrated) // config.rollout
         model.set_logger(training_state.make_logger(config.run, content, iterations))
         return seconds, evaluations
@@ -305,7 +320,12 @@ class _Session:
     def _test(self) -> None:
         """Test the best policy in the analytic engine and in PyBullet; print success and events."""
         config = self.config
-        _say(self.console, f"testing {config.test_episodes} held-out episodes in each engine ...")
+        best = max(run_folder.evaluations(config.run), key=callbacks.quality)["steps"]
+        _say(
+            self.console,
+            f"testing the best policy, of step {best:,}, in {config.test_episodes} held-out "
+            "episodes in each engine ...",
+        )
         rates: dict[str, list[str]] = {}
         for engine in _TESTED:
             test = EvaluationConfig(

@@ -19,12 +19,12 @@ from typing import Annotated, Any, Final
 import tyro
 import yaml
 
-from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning import provenance
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import (
     UNSET,
     EnvOptions,
+    GivenEnvOptions,
     Randomised,
     TrainingConfig,
     check_least,
@@ -84,7 +84,7 @@ class TuneConfig:
     folder: Annotated[Path, unset(Path, "runs/tune-<env>-<algo>", "FOLDER")] = UNSET
     """New folder for the runs, their logs and the best recipe."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Domain randomisation, as in train."""
@@ -100,6 +100,7 @@ def tune(config: TuneConfig) -> Path:
         ConfigError: An option is not valid, the folder exists, or no training ended.
         MissingPackageError: Ray Tune or Optuna is missing.
     """
+    provenance.require_packages({"ray": "cluster", "optuna": "cluster"})
     check_least(config, 1, "trials", "jobs", "steps")
     check_least(config, 0, "seed")
     if (config.jobs or 1) > _MOST_JOBS:
@@ -125,13 +126,10 @@ def tune(config: TuneConfig) -> Path:
 
 def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[str, Any]:
     """Return the changes of the best trial."""
-    try:
-        import ray
-        from optuna.samplers import TPESampler
-        from ray import tune as ray_tune
-        from ray.tune.search.optuna import OptunaSearch
-    except ImportError as error:
-        raise MissingPackageError("ray[tune] and optuna", "cluster") from error
+    import ray
+    from optuna.samplers import TPESampler
+    from ray import tune as ray_tune
+    from ray.tune.search.optuna import OptunaSearch
 
     here = Path.cwd()  # Ray Tune works in folders of its own
 
@@ -190,8 +188,7 @@ def _train(
     _write(recipe, base, changes)
     options = {"algo": base.algo, "env": base.env, "steps": base.steps, "seed": seed + number}
     options |= {"recipe": recipe, "run": run, "test-episodes": 0, **base.env_options.given()}
-    flags = [f"--{key}" for key, value in options.items() if value is True]
-    words = [f"--{key}={value}" for key, value in options.items() if value is not True] + flags
+    words = [f"--{key}={value}" for key, value in options.items()]
     words += ["--randomisation", *base.randomisation] if base.randomisation else []
     # In a process of its own: Ray Tune calls this in a thread, which cannot receive signals.
     with log.open("w", encoding="utf-8") as file:

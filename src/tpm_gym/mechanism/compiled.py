@@ -177,7 +177,7 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
     """Convert vectors (..., length) to the type of array for which the loops are compiled."""
     array = np.ascontiguousarray(values, np.float64)
     if array.shape[-1] != length:
-        raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")
+        raise InputError(f"shape of {name}", array.shape, f"(..., {length})")
     return array if array.flags.writeable else array.copy()
 
 

@@ -110,7 +110,7 @@ class Description(_Entries):
     format: Literal["tpm_gym.policy"]
     version: Literal[1]
     env_id: _Name = Field(alias="env")
-    env_options: dict[Literal["machine", "engine", "drive", "shield"], _Name | bool] = {}
+    env_options: dict[Literal["machine", "engine", "drive", "shield"], _Name | bool | float] = {}
     algorithm: _Name
     seed: _Count | None
     steps: _Count

@@ -172,7 +172,8 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
     values = numbers(name, value)
     batch = values.shape[: values.ndim - len(shape)]
     if values.shape != batch + shape or len(batch) > 1:
-        raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
+        many = ", ".join(map(str, ("n", *shape)))
+        raise InputError(f"shape of {name}", values.shape, f"{shape} or ({many})")
     with np.errstate(over="ignore"):
         rows = values.reshape(-1, math.prod(shape)).astype(np.float32).astype(np.float64)
     if not np.isfinite(rows).all():

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tpm_gym.arrays import finite
+from tpm_gym.arrays import brief, finite
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
@@ -18,6 +18,10 @@ __all__ = ["check"]
 
 _EXAMPLES = 7
 """States with which a task is checked; no other size is 7, so that axes cannot be confused."""
+_OWN_ROW = (
+    "equal results for equal states: from the robot's own row (reduce by axis=-1), and in every "
+    "call (store nothing in the task)"
+)
 
 
 def check(task: Task, taken: Sequence[str] = ()) -> None:
@@ -50,8 +54,12 @@ def check(task: Task, taken: Sequence[str] = ()) -> None:
     for row in (0, _EXAMPLES - 1):
         alone = _results(task, several.take([row]))
         for name, values in together.items():
-            if np.shape(values)[:1] != (_EXAMPLES,) or not _equal(values[row], alone.get(name)):
+            shape, single = np.shape(values), alone.get(name, ())
+            if shape[:1] != (_EXAMPLES,) or np.shape(single) != (1, *shape[1:]):
                 raise _wrong_rows(name, values, "(n, ...)")
+            if not np.allclose(values[row], single[0], equal_nan=True):
+                found = f"{brief(values[row])} among {_EXAMPLES} robots, {brief(single[0])} alone"
+                raise ConfigurationError(name, found, _OWN_ROW)
 
 
 def _results(task: Task, state: State) -> dict[str, Any]:
@@ -104,11 +112,6 @@ def _require_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
 def _wrong_rows(name: str, values: Any, wanted: str) -> ConfigurationError:
     valid = f"values {wanted} for n robots, each from its own row; reduce by axis=-1"
     return ConfigurationError(name, f"of shape {np.shape(values)} for {_EXAMPLES}", valid)
-
-
-def _equal(row: Any, single: Any) -> bool:
-    """Return whether a row equals the result of the state alone, (1, ...)."""
-    return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
 
 
 def _example_states(machine: Machine, scene: Scene) -> State:

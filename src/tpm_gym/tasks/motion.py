@@ -70,24 +70,31 @@ class Motion:
             command = self._control.command(action[None], command[None])[0]
         return command
 
-    def holding(self, name: str = "object") -> bool:
-        """Return whether the cup holds the object of that name.
+    def holding(self, name: str | None = None) -> bool:
+        """Return whether the cup holds the object of that name, by default the only object.
 
         Raises:
-            ConfigurationError: If the task does not observe the object.
+            ConfigurationError: If the task does not observe the object, or has several and ``name``
+                is None.
         """
-        return bool(self._see(f"{name}_held")[0] > 0.5)
+        return bool(self._see(name, "held")[0] > 0.5)
 
-    def carried_to(self, place: FloatArray, name: str = "object") -> FloatArray:
+    def carried_to(self, place: FloatArray, name: str | None = None) -> FloatArray:
         """Return P (3,) m, machine's frame, that has the held object's centre at ``place`` (world).
 
-        The cup does not hold an object exactly at its middle.
+        The cup does not hold an object exactly at its middle. Name and errors are as in
+        :meth:`holding`.
         """
-        grip = self.seen["position"] - self._see(f"{name}_position")
+        grip = self.seen["position"] - self._see(name, "position")
         return self.machine.mount.to_paper(place + grip)
 
-    def _see(self, entry: str) -> FloatArray:
-        if entry not in self.seen:
+    def _see(self, name: str | None, what: str) -> FloatArray:
+        if name is None:
+            names = [entry[: -len("_held")] for entry in self.seen if entry.endswith("_held")]
+            if len(names) > 1:
+                raise ConfigurationError("name", name, f"one of {', '.join(names)}")
+            name = names[0] if names else "object"
+        if (entry := f"{name}_{what}") not in self.seen:
             valid = f"entries with {entry!r}; add object_entries(i) of that object"
             raise ConfigurationError("observed()", list(self.seen), valid)
         return self.seen[entry]
@@ -172,7 +179,7 @@ class Motion:
 
     def _above(self, block: Block, clearance: float) -> FloatArray:
         """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
-        place = self._see(f"{block.name}_position") + hanging(block)
+        place = self._see(block.name, "position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:

@@ -134,6 +134,8 @@ class Task(ABC):
             raise ConfigurationError("tolerance", self.tolerance, "a positive number")
         if not is_whole(self.camera_delay, 0):
             raise ConfigurationError("camera_delay", self.camera_delay, "a whole number, 0 or more")
+        if not isinstance(self.scene, Scene):
+            raise ConfigurationError("scene", self.scene, "a Scene; Scene() has no objects")
         self.machine, self.reward, self.goals = machine, reward, goals
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
