@@ -16,8 +16,8 @@ pushes leans on the lip only because the table brakes it. Without friction N is 
 be as slippery as ice. So this module adds the missing friction as a force, from the last N.
 
 Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
-by one time step. The smaller scale never falls below :data:`_LEAST`. Contacts between objects keep
-the box where they stick, and upright ones then have no friction in a steady push.
+by one time step. The smaller scale never falls below :data:`_LEAST`. Level contacts between objects
+keep the box where they stick, and all of them in the first time step of a slide.
 """
 
 from __future__ import annotations
@@ -84,7 +84,9 @@ class _Motion(NamedTuple):
 
     def at(self, point: Vector) -> Vector:
         """Compute the velocity of a point of the body, m/s."""
-        (x, y, z), (u, v, w), (p, q, r), (a, b, c) = *self[2:5], point
+        if self.turning is _ZERO:
+            return self.velocity
+        (x, y, z), (u, v, w), (p, q, r), (a, b, c) = self.place, self.velocity, self.turning, point
         x, y, z = a - x, b - y, c - z
         return u + q * z - r * y, v + r * x - p * z, w + p * y - q * x
 
@@ -212,12 +214,13 @@ class Friction:
 
     def _motion(self, body: int) -> _Motion:
         place, _ = pybullet.getBasePositionAndOrientation(body, self._number)
-        return _Motion(body, -1, place, *pybullet.getBaseVelocity(body, self._number), True)  # type: ignore[call-arg]
+        velocity, turning = pybullet.getBaseVelocity(body, self._number)
+        return _Motion(body, -1, place, velocity, turning, free=True)
 
     def _lip(self) -> _Motion:
         body, link = self._cup.body, self._cup.link
         state = pybullet.getLinkState(body, link, 1, 0, self._number)
-        return _Motion(body, link, state[0], state[6], _ZERO, True)  # it does not turn
+        return _Motion(body, link, state[0], state[6], _ZERO, free=True)  # it does not turn
 
     def _slide(
         self,
@@ -328,7 +331,7 @@ def _beside(points: Sequence[Any]) -> list[Any]:
 
 
 def _surface(face: _Face) -> _Motion:
-    return _Motion(face.body, face.link, _ZERO, (face.speed, 0.0, 0.0), _ZERO, False)
+    return _Motion(face.body, face.link, _ZERO, (face.speed, 0.0, 0.0), _ZERO, free=False)
 
 
 def _slip(motion: _Motion, other: _Motion, point: Any) -> _Slip:
