@@ -130,6 +130,7 @@ class Friction:
         self._lacks: _Lacks = {}  # of the last time step
         self._lacked: _Lacks = {}  # of the one before
         self._active: list[int] = []
+        self._held = -1  # body id of the held object
         self._resting: set[int] = set()
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
@@ -176,6 +177,7 @@ class Friction:
 
     def scale(self, held: int) -> None:
         """Scale the friction of objects that may slip; call before each time step."""
+        self._held = self._bodies[held][0] if held >= 0 else -1
         self._pushed, self._pushes = self._pushes, {}
         self._lacked, self._lacks = self._lacks, {}
         for index in self._active:
@@ -245,7 +247,8 @@ class Friction:
         slips = [_slip(motion, other, point) for point in points]
         if face is not None:
             self._set(face, _scales(slips, points, coefficient))
-        if max(slip[3] for slip in slips) <= _FAST:
+        # Rigid, the forces on a held object are not determined, so that N has no meaning there.
+        if motion.body == self._held or max(slip[3] for slip in slips) <= _FAST:
             return
         pair, lack = (motion.body, other.body), _lack(motion, slips, points, coefficient)
         self._lacks[pair] = lack
