@@ -1,7 +1,7 @@
-"""Compile functions by Numba, and keep their machine code on disk.
+"""Compilation of functions by Numba; their machine code is kept on disk.
 
-Importing this module imports Numba, which takes some 0.3 s. Modules that compile are therefore
-imported when something is first computed.
+Importing this module imports Numba, which takes some 0.3 s. Modules with compiled functions are
+therefore imported only at the first computation.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ def compiled(function: _Function) -> _Function:
 def kept(function: _Function) -> _Function:
     """Compile a function as :func:`compiled` does, and keep its machine code on disk.
 
-    It is compiled again when a source changes that is compiled into it, and when the file on disk
-    is damaged. Where no folder can be written, it is compiled in memory.
+    It is compiled again if any source that is compiled into it has changed, or if the file on disk
+    is damaged. If no folder can be written, it is compiled in memory.
     """
     dispatcher: Any = compiled(function)
     dispatcher._cache = _Cache(function)
@@ -56,7 +56,7 @@ def kept(function: _Function) -> _Function:
 
 
 class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has no types
-    """Numba's contents of a file, with the stamp of the function."""
+    """Content of a file in Numba's cache: machine code, with the stamp of its function."""
 
     stamp = ""
 
@@ -67,8 +67,8 @@ class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has
     def rebuild(self, target_context: Any, payload: Any) -> Any:
         """Return the machine code; None if other sources were compiled.
 
-        Numba writes a new index first, then the code. A process that is killed in between, or reads
-        in between, would take the code of other sources for this function's.
+        Numba writes a new index first, then the code. Until the code is written, or if the process
+        is killed before, the new index points to the code of older sources.
         """
         stamp, code = payload
         return super().rebuild(target_context, code) if stamp == self.stamp else None
@@ -84,7 +84,7 @@ class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
     _impl_class = _Code
 
     def renew(self, stamp: str) -> None:
-        """Set the stamp that files must have. Numba's own covers only the function's file."""
+        """Set the stamp that files must have; Numba's own stamp covers one source file only."""
         self._cache_file._source_stamp = self._impl.stamp = stamp
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
@@ -92,7 +92,7 @@ class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
 
 
 class _Cache:
-    """Numba's cache of a function, renewed with any of the function's sources; never raises."""
+    """Cache of a function's machine code, renewed if any of its sources changes; never raises."""
 
     _announced = False
 
@@ -151,7 +151,7 @@ class _Cache:
 
 _CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
 _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
-"""Packages whose functions are found by name; their sources are not read."""
+"""Packages whose functions enter a stamp by name only; their sources are not read."""
 
 
 def stamp(function: Callable[..., Any]) -> str:
@@ -161,9 +161,9 @@ def stamp(function: Callable[..., Any]) -> str:
 
 
 def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield text that is equal in all processes if what a value refers to is equal.
+    """Yield text about a value that is equal in all processes if code and constants are equal.
 
-    The order counts: the same functions and constants in other places are another function.
+    The order counts, because the same parts in another order make another function.
     """
     value = getattr(value, "py_func", value)
     if isinstance(value, tuple):
@@ -187,9 +187,9 @@ def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
 
 
 def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield the source of a function, class or module, and what the function refers to.
+    """Yield the source of a function, class or module, then text about everything that it uses.
 
-    The code may be older than the source, which may have been edited since it was imported.
+    A function's bytecode is included, because its file may have been edited since the import.
     """
     module = str(value.__name__ if isinstance(value, ModuleType) else value.__module__)
     yield f"{module} {getattr(value, '__qualname__', '')}"
@@ -210,7 +210,7 @@ def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
 
 
 def _used(function: Any) -> Iterator[Any]:
-    """Yield the values of a function's names: globals, attributes of modules, closure, defaults."""
+    """Yield the values that a function uses: closure, defaults, globals, attributes of modules."""
     names, scope = set(_names(function.__code__)), function.__globals__
     yield from (cell.cell_contents for cell in function.__closure__ or ())
     yield function.__defaults__

@@ -77,7 +77,7 @@ class NearestSingularity:
 
 
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
-    """Return the factors (..., 8) over lengths, so that one tolerance suits all.
+    """Divide the factors by lengths, (..., 8), so that one tolerance suits all.
 
     level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
     """
@@ -93,8 +93,9 @@ def classify(
 ) -> Classification:
     """Classify joint angles theta (..., 3) rad (section "Singularity analysis").
 
-    A dimensionless factor counts as zero up to ``tolerance``. Use 1e-7 or more: a factor that
-    merges two branches is computed from joint angles to the square root of rounding only.
+    A dimensionless factor counts as zero up to ``tolerance``. Use 1e-7 or more: where two branches
+    merge, a factor computed from joint angles has an error of about the square root of the
+    rounding error.
     """
     return _classify(factors(theta, branch, geometry), geometry, tolerance)
 

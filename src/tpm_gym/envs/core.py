@@ -51,7 +51,7 @@ INFO: Final = {
 """Types of the entries of every info by name; the task's events are further entries."""
 
 _TAKEN: Final = ("randomisation", "final_obs", "final_info", "episode")
-"""Further entries that this package and Gymnasium add to infos."""
+"""Other names of info entries that a task must not use: this package or Gymnasium adds them."""
 
 Observation = dict[str, Any]  # arrays of float32
 Report = tuple[Observation, FloatArray, dict[str, Any]]
@@ -362,7 +362,7 @@ class Core:
         return EnvSnapshot(self.kind, self._save_simulation(), rngs, copies)
 
     def _save_simulation(self) -> Snapshot:
-        """Return a snapshot, and read :attr:`state` again: the simulation restarts from it."""
+        """Return a snapshot; read :attr:`state` again, since saving restarts the simulation."""
         snapshot = self.simulation.save()
         self._state = self.simulation.state()
         return snapshot
@@ -462,7 +462,7 @@ def _box(bound: float, length: int) -> spaces.Box:
 
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:
-    """Add the reward's terms that do not depend on the goal."""
+    """Return the sum of the reward terms that do not depend on the goal."""
     total: Any = 0.0
     for name, value in terms.items():
         if name != "goal":
@@ -508,7 +508,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
 
 
 def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
-    """Refuse arrays that are no batch of goals; goals that are not finite are no success."""
+    """Refuse arrays that are no batch of goals; goals that are not finite count as no success."""
     shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
     try:
         np.broadcast_shapes(*shapes)

@@ -180,9 +180,9 @@ def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
 def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Find zeros (..., 2 d) of trigonometric polynomials of degree d, and whether they may be real.
 
-    The polynomials are given by their values (..., 2 d + 1) at equal steps from 0 through a turn.
+    The polynomials are given by their values (..., 2 d + 1) at equally spaced angles in [0, 2 pi).
     The zeros are eigenvalues w = exp(i phi) of the companion matrix, in order of phi in (-pi, pi].
-    If phi is real, w is on the unit circle.
+    A zero may be real if w is close to the unit circle.
     """
     degree = values.shape[-1] - 1
     coefficients = np.fft.fftshift(np.fft.fft(values), axes=-1)
@@ -205,7 +205,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     Missing solutions are NaN. There is a slot for each pair of :data:`.modes.ROTATED_MODES`.
 
     Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
-    the closures of rods 4a and 4b are equal, and the closure of rod 6 is linear in rho. Its square
+    the closures of rods 4a and 4b are equal, and the closure of rod 6 is linear in rho. Squared, it
     is a trigonometric polynomial of degree 2, a quartic in tan(phi / 2).
     """
     g = geometry
@@ -214,7 +214,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
 
     def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return rho^2, and p and q of 2 rho p = q."""
+        """Return rho^2, p and q, where the closure of rod 6 is 2 rho p = q."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rho2 = reach2 - (2 * g.l5 * n.imag) ** 2
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
@@ -243,11 +243,12 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 
 
 def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Solve theta_1 and tilt, (..., 6), for P and P - C1 in the frame of link 3', seen along y.
+    """Solve for theta_1 and tilt, (..., 6), given P, and P - C1 in the frame of link 3'.
 
-    B1C1 halves the angle where l3 sin(theta_1) equals ``up``, and the rods close where
-    l3 cos(theta_1) equals ``out``. The sum of both squares is l3^2. Times cos^2(phi / 2), that is a
-    trigonometric polynomial of degree 3.
+    Both vectors are seen along y. B1C1 halves the angle between links 3 and 3' if l3 sin(theta_1)
+    equals ``up``. Rods 4 have their length if l3 cos(theta_1) equals ``out``. Both depend on the
+    tilt phi alone, so up^2 + out^2 = l3^2 gives phi. Multiplied by cos^2(phi / 2), this equation is
+    a trigonometric polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 

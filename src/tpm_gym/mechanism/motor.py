@@ -1,4 +1,4 @@
-"""Motors: consistent torque, size, inertia and speed.
+"""Motors whose torque, size, inertia and speed are consistent.
 
 A direct drive has no gear. Its torque follows from the magnetic shear stress sigma in the air gap,
 
@@ -74,7 +74,7 @@ class Motor:
         ]
 
     def stator(self, axis: Axis, centre: Vector) -> list[Solid]:
-        """Build the housings along ``axis`` about ``centre``; the shaft ends in front of them."""
+        """Build the housings along ``axis`` about ``centre``; the shaft projects beyond them."""
         size = (self.stator_radius, self.reach - self.clearance - 2 * _FACE, 0.0)
         return [
             Solid("cylinder", size, at, ALUMINIUM, axis=axis, colour="dark")
@@ -82,7 +82,7 @@ class Motor:
         ]
 
     def halves(self, axis: Axis, centre: Vector = (0.0, 0.0, 0.0)) -> tuple[Vector, Vector]:
-        """Return the middles of both halves, m."""
+        """Return the centres of the motor's two halves, m."""
         away = (self.clearance + self.reach) / 2
         x, y, z = (away if name == axis else 0.0 for name in "xyz")
         u, v, w = centre

@@ -1,4 +1,4 @@
-"""Arms, rods and motors of which mechanisms are built: their sizes and materials."""
+"""Sizes and materials of the arms, rods and motors of mechanisms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 CARBON_FIBRE = 1600.0  # kg/m^3
 SLIDES: Final = ("platform_x", "platform_y", "platform_z")
 TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-"""Joints of :func:`free_platform`; their positions are P (m) and 0 (rad)."""
+"""Joints of :func:`free_platform`: slides, whose positions are P (m), and turns, always 0 rad."""
 FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 
@@ -70,7 +70,11 @@ def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 def motor(
     name: str, axis: Vector, origin: Vector, level: float, sense: int, rpy: Vector = LEVEL
 ) -> Joint:
-    """Build a motor. Its arm points outwards at theta = ``level``, and ``sense`` is downwards."""
+    """Build the joint of a motor.
+
+    Its arm points outwards at theta = ``level``. ``sense`` (1 or -1) is the direction of theta in
+    which the arm turns towards the platform.
+    """
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
     line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
     return Joint(name, "revolute", "base", origin, axis, lower, upper, *line, rpy)
@@ -97,9 +101,9 @@ def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tu
 def free_platform(solids: tuple[Solid, ...], reach: float) -> list[Link]:
     """Build a platform with its origin at P that belongs to no leg.
 
-    Three slides and three revolutes, with next to no mass between them, leave it free. So every leg
-    can end in loop closures, and none is within one branch of the tree, as PyBullet's direct solver
-    needs it.
+    Three slides and three revolutes, with almost no mass between them, let it move freely. So every
+    leg can end in loop closures, and every closure connects two branches of the tree. PyBullet's
+    direct solver needs this.
 
     Args:
         solids: Solids of the platform.

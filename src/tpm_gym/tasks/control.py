@@ -23,7 +23,7 @@ __all__ = ["CartesianControl", "Control", "Follower", "JointControl", "make_cont
 _TRIES = 6  # largest number of shares of a step that are tried
 _AIM = 0.9995  # fraction of the limit that a try aims at
 USABLE = 0.95
-"""Share of the peak torque that commands may need; the rest is for what disturbs the robot."""
+"""Share of the peak torque that commands may need; the rest is a reserve for disturbances."""
 _PARTS = 32  # parts of a line; within a part, joints turn almost uniformly
 
 
@@ -46,10 +46,10 @@ class Control(Protocol):
         """Return the number of control steps between two points (3,) m at the highest speed."""
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Return points (n, 3) m in units of actions, (n, 3): differences are actions."""
+        """Convert points (n, 3) m to coordinates (n, 3) whose differences are actions."""
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Return the motion of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
+        """Return the displacement of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
 
 
 class CartesianControl:
@@ -76,7 +76,7 @@ class CartesianControl:
         return actions
 
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
-        """Count the steps of the axis that has farthest to go."""
+        """Return the number of steps along the axis that needs the most."""
         return float((np.abs(wanted - current) / self._step).max())
 
     def scaled(self, points: FloatArray) -> FloatArray:
@@ -84,7 +84,7 @@ class CartesianControl:
         return points / self._step
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Repeat the step limit, on the diagonal."""
+        """Return diagonal matrices of the step limit."""
         return np.tile(np.diag(self._step), (len(points), 1, 1))
 
 
@@ -122,9 +122,9 @@ class JointControl:
     def _tried(
         self, current: FloatArray, theta: FloatArray, step: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return P (r, 3) m after a share (r,) of the increment, and its way in units of the limit.
+        """Return P (r, 3) m after a share (r,) of the increment, and its path over the step limit.
 
-        The way is infinite where P cannot be assembled in the machine's modes.
+        The second result is infinite where the machine cannot be assembled in its modes.
         """
         point = self._machine.forward(theta + share[:, None] * step)
         way = (np.abs(point - current) / self._step).max(axis=-1)
@@ -188,11 +188,12 @@ class JointControl:
 
 
 class Follower:
-    """Limit of commands to what the motors can follow, by closed-form dynamics.
+    """Limit of commands to motions that the motors can follow, by closed-form dynamics.
 
-    The change of the step from one command to the next is limited along each axis. It is then
-    shortened as a whole to what a share of the motors' peak torques allows the nominal machine,
-    :data:`USABLE`. No command goes too fast towards an end of the region to stop there.
+    A step is the difference of two successive commands. Its change from the last step is limited
+    along each axis. The step itself is limited so that P can stop at an end of the region. Then the
+    change is scaled down as a whole until the nominal machine needs at most the share
+    :data:`USABLE` of its motors' peak torques.
 
     Args:
         machine: Machine; its payload counts.
@@ -204,7 +205,7 @@ class Follower:
     def __init__(
         self, machine: Machine, acceleration: ArrayLike, braking: ArrayLike, period: float
     ) -> None:
-        """Take the limits of a machine."""
+        """Compute the limits of a machine in a control period."""
         self._machine, self._period = machine, period
         self._change, self._brake = (np.array(rate) * period**2 for rate in (acceleration, braking))
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)

@@ -59,7 +59,7 @@ class _Box(NamedTuple):
 
 @compiled
 def _two(a: int, b: int) -> tuple[int, int]:
-    """Return a pair of integers. For literal constants, Numba would compile callers again."""
+    """Return a pair of integers; a literal constant would make Numba compile functions again."""
     return 1 * a, 1 * b
 
 
@@ -118,7 +118,7 @@ def collide_objects(
         objects: (k,) objects.
         held: Index of the held object; -1 for none.
         setting: Constants of the simulation.
-        polygons: (2, 12, 3) m, workspace.
+        polygons: (2, 12, 3) m, scratch memory.
         contacts: Output.
         count: Number of contacts at the call.
     """
@@ -145,7 +145,7 @@ def collide_objects(
 def _collide_table(
     box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
-    """Add the corners of an object near table or belt, or near the floor if it is beside both."""
+    """Add contacts of corners with table or belt; with the floor if the centre is beside both."""
     (x, y, z), (count, slot), (low, high, edge) = box.middle, place, setting.table
     over = low <= x <= high and abs(y) <= edge
     height = z - (TABLE.top if over else FLOOR.top)
@@ -352,7 +352,7 @@ def _collide_boxes(
 
 @compiled
 def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
-    """Return the arms (m) to the nearest points of two edges along axes i and j."""
+    """Return the vectors (m) from both centres to the nearest points of edges i and j."""
     a, b, (p, q) = one.middle, two.middle, (one.frame[i], two.frame[j])
     for k in range(3):
         if k != i:
