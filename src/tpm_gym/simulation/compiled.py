@@ -167,7 +167,8 @@ def measured(
 
     Returns:
         (n, 9 + 12 k): position, velocity, command minus position; then for each object its centre,
-        its top minus the lip, its velocity, x and y of its z axis, and its share of the vacuum.
+        its top minus the lip, its velocity, x and y of its z axis, and vacuum / most if it is held,
+        else 0.
     """
     values = np.empty((len(position), 9 + 12 * len(halves)))
     for row in range(len(position)):
@@ -280,22 +281,24 @@ def friction_force(
 ) -> tuple[Vector, Vector]:
     """Compute Coulomb's friction on a block for the next time step, from the slip in the last.
 
-    The force ends the slip within a few time steps. A sticking contact needs a force without slip.
-    It is the sum of earlier forces.
+    The force has two parts. The first part would end the slip in one time step. The second part
+    holds a block that sticks, at which there is no slip: each time step adds half of the first part
+    to it.
 
     Args:
         point: Point of contact, m.
         normal: Unit vector towards the block.
         place: Centre of the block, m.
-        motion: Velocity (m/s) and angular velocity (rad/s) of the block, velocity of the other.
-        before: Sum of earlier forces, N.
-        most: Largest friction, N; none if negative.
+        motion: Velocity (m/s) and angular velocity (rad/s) of the block, and velocity (m/s) of the
+            other body.
+        before: Second part of the force in the last time step, N.
+        most: Largest friction, N; a negative value is taken as 0.
         mass: Mass of the block, kg.
         moments: Principal moments of inertia of the block, which is assumed upright, kg m^2.
         step: Time step, s.
 
     Returns:
-        The friction on the block, and the sum of earlier forces then, N.
+        The friction on the block, and its second part, N.
     """
     arm = plus(point, place, -1.0)
     slip = plus(plus(motion[0], cross(motion[1], arm)), motion[2], -1.0)
@@ -311,7 +314,7 @@ def friction_force(
 
 @compiled
 def _at_most(vector: Vector, most: float) -> Vector:
-    """Return a vector, shortened to a length; zero for a negative length."""
+    """Shorten a vector to the length ``most`` if it is longer; negative is taken as 0."""
     share = min(1.0, max(most, 0.0) / max(length(vector), 1e-12))
     return plus((0.0, 0.0, 0.0), vector, share)
 
@@ -420,7 +423,7 @@ def arrived(
 
     Returns:
         P one time step before the end, and at the end (n, 3) m; joint positions (n, 3) rad and
-        velocities (n, 3) rad/s; force on P as if the held objects had no inertia (n, 3) N.
+        velocities (n, 3) rad/s; force on P without the inertial force of held objects (n, 3) N.
     """
     shape, last, now = (len(theta), 3), theta.shape[1] - 1, points.shape[1] - 1
     before, position, force = np.empty(shape), np.empty(shape), np.empty(shape)
@@ -440,6 +443,9 @@ def arrived(
 @kept
 def differences(theta: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return joint positions, velocities and accelerations (n, k, 3) in k time steps.
+
+    The positions are at the beginning of each time step. The velocities are the mean velocities of
+    the time step before.
 
     Args:
         theta: (n, k + 2, 3) rad, at the ends of time steps.
@@ -511,7 +517,7 @@ def along(
         references: Output.
     """
     steps = len(references.theta)
-    for k in range(steps):  # outermost, because references are written along rows
+    for k in range(steps):  # outermost loop, so that the arrays are written in their order
         share = k / max(steps - 1, 1)
         for row in range(len(theta)):
             for i in range(3):
