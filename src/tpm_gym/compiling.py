@@ -77,8 +77,9 @@ class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has
 class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
     """Numba's files, found by stamp, signature and processor.
 
-    Numba also asks for an equal pickle of the closure. But the pickle of a function differs between
-    a process that reads its source and one that reads its bytecode. The stamp covers the closure.
+    Numba itself also compares a pickle of the function's closure. This class does not: the pickle
+    differs between a process that reads the source and one that reads its bytecode. The stamp
+    covers the closure.
     """
 
     _impl_class = _Code
@@ -156,7 +157,7 @@ _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
 
 def stamp(function: Callable[..., Any]) -> str:
     """Compute a hash of all that is compiled into a function: code, sources and constants."""
-    # The options of Numba are in this file.
+    # This file is included because it has the options of Numba.
     return hashlib.sha256("\n".join([_text(__file__), *_parts(function, {})]).encode()).hexdigest()
 
 
@@ -202,7 +203,7 @@ def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
     if inspect.isfunction(value):
         for used in (value.__code__, *_used(value)):
             yield from _parts(used, seen)
-    elif isinstance(value, ModuleType):  # a namespace: others call functions of it by name
+    elif isinstance(value, ModuleType):  # a namespace, whose functions are called by name
         for _, own in sorted(vars(value).items()):
             own = getattr(own, "py_func", own)
             if inspect.isfunction(own) and own.__module__ == module:

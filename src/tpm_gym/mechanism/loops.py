@@ -1,12 +1,16 @@
 """Compiled loops over rows of a mechanism's kinematics and dynamics.
 
-A loop takes a tuple of inputs (m, 3), ``limit`` (m), ``built``, ``machine``, and a tuple of arrays
-for its results, which are NaN where there is none. Of m rows, row i belongs to the
-machine ``built[i // (m // b)]`` of b machines. A row of ``built`` (b, k) holds the lengths (m) and
-the constants of the dynamics. ``machine`` holds the signs of the modes, and at its end gravity (3)
-m/s^2. Each row is computed by itself, so that it has the same bits alone and among thousands.
+A loop takes five arguments:
 
-Rows are copied to columns of a block, over which the compiler computes several rows at a time.
+* ``inputs``: a tuple of arrays (n, 3).
+* ``limit``: a distance, m, for the loops that compare positions.
+* ``built``: (b, k), the lengths (m) and the constants of the dynamics of b machines. Row i of the n
+  rows belongs to machine ``built[i // (n // b)]``.
+* ``machine``: the signs of the modes, then gravity (3), m/s^2.
+* ``results``: a tuple of arrays with n rows, which the loop fills; NaN where there is no solution.
+
+A row does not depend on the others, so it has the same bits alone and among thousands. Rows are
+copied to columns of a block, so that the compiler can compute several rows at a time.
 """
 
 import math
@@ -31,21 +35,24 @@ _NONE: Final = (0.0, 0.0, 0.0)
 class Equations(NamedTuple):
     """Functions of one mechanism that the loops call; all of them are compilable.
 
+    Each attribute is given as (arguments) -> results. ``rates`` and ``changes`` are the first and
+    second derivatives of the joint positions by time.
+
     Attributes:
-        modes: Signs of the modes, from ``machine``.
-        lengths: Lengths of row j of columns.
-        inertia: Constants of the dynamics of row j of columns.
-        posture: Joint positions for a point, modes and lengths, and whether they are real.
-        pose: Configuration at joint positions, for modes and lengths; whether it is real; and
-            whether it is in the working mode.
-        position: Point P of a configuration.
-        regular: Whether J exists, for a configuration and lengths.
-        velocity: Rows of J of a configuration.
-        same_side: Whether P at a point is on the assembly mode's side, with the arms as in a
-            configuration, for modes and lengths.
-        torques: Torques for a configuration, rates, their changes, gravity and inertia.
-        gather: Torques that balance a force at P.
-        masses: Upper triangle of M for a configuration, J and inertia.
+        modes: (machine) -> signs of the modes.
+        lengths: (columns, j) -> lengths of row j.
+        inertia: (columns, j) -> constants of the dynamics of row j.
+        posture: (point, modes, lengths) -> joint positions; whether they are real.
+        pose: (joint positions, modes, lengths) -> configuration; whether it is real; whether it is
+            in the working mode.
+        position: (configuration) -> point P.
+        regular: (configuration, lengths) -> whether J exists.
+        velocity: (configuration) -> rows of J.
+        same_side: (configuration, point, modes, lengths) -> whether the point is on the assembly
+            mode's side. Use only the arms of the configuration, since the rest may not be real.
+        torques: (configuration, rates, changes, gravity, inertia) -> torques.
+        gather: (configuration, force at P) -> torques J^T force.
+        masses: (configuration, J, inertia) -> upper triangle of M.
     """
 
     modes: Callable[..., Any]
@@ -85,9 +92,10 @@ def _place(
 
 
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
-    """Fill the columns ``own`` with the machine parameters of the rows from ``start`` on.
+    """Fill the columns ``own`` with the machine parameters of ``count`` rows from ``start`` on.
 
-    If all rows belong to one machine, only the first block fills them, and all blocks use them.
+    Each machine has ``each`` rows. If all rows belong to one machine, only the first block fills
+    the columns, and all blocks use them.
     """
     if start == 0 or len(built) > 1:
         for j in range(count):
@@ -97,7 +105,7 @@ def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray)
 
 
 def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: int) -> None:
-    """Copy ``count`` of the ``rows`` (m, 3) to three columns, from ``first`` on."""
+    """Copy ``count`` of ``rows`` (n, 3), from ``start`` on, to three columns, from ``first`` on."""
     for j in range(count):
         columns[first, j] = rows[start + j, 0]
         columns[first + 1, j] = rows[start + j, 1]
@@ -105,7 +113,7 @@ def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: 
 
 
 def _write(columns: FloatArray, first: int, start: int, count: int, rows: Any) -> int:
-    """Copy columns to ``rows``, (m,), (m, 3) or (m, 3, 3); return the next column's index."""
+    """Copy columns to ``rows``, (n,), (n, 3) or (n, 3, 3); return the next column's index."""
     if rows.ndim == 1:
         for j in range(count):
             rows[start + j] = columns[first, j]

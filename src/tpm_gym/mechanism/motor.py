@@ -21,7 +21,7 @@ from typing import Literal
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Solid
 
-_FACE = 0.002  # m
+_FACE = 0.002  # m, by which each end of a housing is shorter than the shaft
 
 Axis = Literal["x", "y", "z"]
 
@@ -93,7 +93,7 @@ TORQUE_MOTOR = Motor(
     # Experts need at most 10 N m, and reversals at full speed 43 N m. So motors of half this
     # strength still follow. The shear stress is 44 kPa (peak) and 18 kPa (continuous).
     peak_torque=100.0,
-    continuous_torque=40.0,  # 100 W: 0.17 m^2 of housing, 60 K above the room
+    continuous_torque=40.0,  # loses 100 W: 0.17 m^2 of housing are 60 K warmer than the room
     motor_constant=4.0,
     no_load_speed=25.0,
     gap_radius=0.060,

@@ -19,9 +19,10 @@ FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 
 _AXES: Final[tuple[Vector, ...]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_SPECK = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, far below what a torque shows
+_SPECK = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, too light to change torques
 
-# Largest angles of an arm from level outwards, towards the base and towards the platform.
+# Largest angles, rad, by which an arm can turn from pointing level outwards: towards the base, and
+# towards the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
 
 
@@ -32,7 +33,7 @@ def displaced(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vect
 
 
 def tube(axis: Literal["x", "y"], length: float, height: float, width: float, wall: float) -> Solid:
-    """Build a rectangular aluminium tube from the link's origin along ``axis``."""
+    """Build a rectangular aluminium tube from the link's origin along ``axis``; sizes in m."""
     outer = (length, width, height) if axis == "x" else (width, length, height)
     inner, low = width - 2 * wall, height - 2 * wall
     bore = (length, inner, low) if axis == "x" else (inner, length, low)
@@ -88,7 +89,7 @@ def saddles(axis: Literal["x", "y"], centre: Vector) -> list[Solid]:
 
 
 def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
-    """Build an actuated arm: motor's shaft and rotor, rectangular tube, elbow bar across."""
+    """Build an arm: the motor's shaft and rotor, a rectangular tube, and a bar across the elbow."""
     shaft = bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)
     return (
         shaft,
