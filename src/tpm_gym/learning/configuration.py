@@ -59,7 +59,7 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_shield(words: Sequence[str]) -> bool | float:
-    """Parse nothing or ``True``, ``False``, or the conditioning that a shield keeps."""
+    """Parse the words after ``--shield``: ``True`` or none, ``False``, or a conditioning."""
     text = " ".join(words) or "True"
     return text == "True" if text in ("True", "False") else float(text)
 
@@ -165,8 +165,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the last test of a policy from --engine analytic, there and in PyBullet; 0 for
-    none."""
+    """Episodes in each engine of the last test, which follows a training in --engine analytic; 0
+    for none."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By time: every 30 s, for at most 2% of the time."""
@@ -191,7 +191,7 @@ class TrainingConfig:
 
     @property
     def horizon(self) -> int:
-        """Number of steps after which an episode is truncated, over all environments."""
+        """Number of steps of one full episode, over all environments."""
         return self.envs * (check_env_id(self.env).max_episode_steps or 0)
 
     @property
@@ -319,7 +319,7 @@ def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
         found = kind.validate_json(text)[CONFIG_FILE]
         recipe_file(found.algo)  # refuses an unknown algorithm
         check_recipes(CONFIG_FILE, {"recipe": found.recipe.entries()}, found.algo)
-    except (ValidationError, AttributeError, ConfigError) as error:  # a recipe of null
+    except (ValidationError, AttributeError, ConfigError) as error:  # AttributeError: recipe: null
         problem = " ".join(str(error).split())
         raise RunError(
             f"the configuration of {run} is damaged: {problem}; start the run anew with tpm-gym "
@@ -387,7 +387,7 @@ def _check_recipe(config: TrainingConfig) -> None:
             f"{where}: {min(sizes, key=sizes.__getitem__)}: 1: advantages of one step cannot be "
             "normalised; raise it, or set normalize_advantage: false",
         )
-    if config.recipe.hindsight:  # it draws from whole episodes
+    if config.recipe.hindsight:  # hindsight samples from whole episodes only
         for name in ("learning_starts", "buffer_size"):
             few, most = config.argument(name), config.argument(name) * envs // config.horizon
             fewer = f", or give at most --envs {most}" if most else ""
@@ -403,7 +403,7 @@ def _check_device(device: str) -> None:
     import torch
 
     try:
-        torch.zeros(1, device=device).item()  # the device meta holds no numbers
+        torch.zeros(1, device=device).item()  # fails on the device meta, which stores no numbers
     except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch without CUDA
         problem = str(error).partition("\n")[0]
         raise ConfigError(f"--device {device}: {problem}; try cpu") from error

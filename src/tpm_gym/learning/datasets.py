@@ -1,8 +1,8 @@
 """Datasets for offline learning, in the format of Minari.
 
-The episodes of ``expert``, ``noisy`` and ``random`` depend on their seeds alone: the command that
-made a dataset makes it again, equal in every bit, and the first episodes of a long dataset are
-those of a short one. ``replay`` depends on the training, too; see :mod:`tpm_gym.learning.replay`.
+The episodes of ``expert``, ``noisy`` and ``random`` depend on their seeds alone. Repeating a
+command therefore gives a bit-equal dataset, and a longer dataset begins with the episodes of a
+shorter one. ``replay`` depends on the training, too; see :mod:`tpm_gym.learning.replay`.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ _OURS: Final = "tpm_gym"  # entry of the metadata that marks our datasets
 class CollectConfig:
     """Collect datasets for offline learning, in the format of Minari.
 
-    The kinds are: the expert's episodes; those of the expert with noise on its actions; uniform
-    random actions; and "replay", the episodes of a policy at ten moments of its training.
+    The kinds are: "expert"; "noisy", the expert with noise on its actions; "random", uniform random
+    actions; and "replay", a policy at ten moments of its training.
     """
 
     env: Annotated[tuple[str, ...], unset(tuple[str, ...], "all with an expert", "ID ...")] = UNSET
@@ -86,13 +86,13 @@ class CollectConfig:
     """Episodes of each dataset."""
 
     seed: int = 0
-    """Seed of the first episode, and of the training of replay."""
+    """Seed of the first episode, and of the training of kind replay."""
 
     noise: float = 0.3
-    """Standard deviation of the noise of noisy, in units of the largest action."""
+    """Standard deviation of the noise of kind noisy, in units of the largest action."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Steps of the training of replay."""
+    """Steps of the training of kind replay."""
 
     out: Annotated[Path, unset(Path, "Minari's", "FOLDER")] = UNSET
     """Folder of the datasets. Minari's is $MINARI_DATASETS_PATH, or ~/.minari/datasets."""
@@ -129,7 +129,7 @@ class Dataset:
 
     @property
     def folder(self) -> Path:
-        """Folder, whose ``data`` Minari loads."""
+        """Folder of the dataset; Minari loads its subfolder ``data``."""
         return self.root / self.name
 
 
@@ -240,7 +240,10 @@ def _record(
 
 
 def _split(steps: Sequence[Step], first_seed: int, count: int) -> Iterator[EpisodeBuffer]:
-    """Yield the episodes of the first ``count`` rows; observations and infos have one more row."""
+    """Yield the episodes of the first ``count`` rows.
+
+    Observations and infos have one entry more than actions: the entry after the last step.
+    """
     from minari.data_collector import EpisodeBuffer
 
     last = steps[-1]
@@ -304,7 +307,7 @@ def _write(dataset: Dataset, scores: tuple[float, float], console: Console) -> s
         storage.update_metadata(_metadata(dataset, scores, found))
         there = dataset.folder / _DATA
         there.mkdir(parents=True, exist_ok=True)
-        for file in data.iterdir():  # beside them may be files that are not ours
+        for file in data.iterdir():  # one by one: the folder may hold files that are not ours
             file.replace(there / file.name)
     return found
 

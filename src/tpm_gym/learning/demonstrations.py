@@ -1,10 +1,11 @@
 """Episodes of the scripted expert from which an algorithm learns before it acts itself.
 
-For an algorithm with a replay buffer, the episodes are added to the buffer. So SAC and TQC learn
-pick-and-place from a sparse reward within minutes (Nair et al. 2018). Episodes are stored whole, so
-that hindsight can relabel them. For an on-policy algorithm such as PPO, the networks are first
-fitted to the episodes (behaviour cloning), and training continues from there (Rajeswaran et al.
-2018). In both cases the episodes count as environment steps, so that learning curves include them.
+For an algorithm with a replay buffer, the episodes are added to the buffer (Nair et al. 2018). With
+them, SAC and TQC learn pick-and-place from a sparse reward within minutes. Episodes are stored
+whole, so that hindsight can relabel them. For an on-policy algorithm such as PPO, networks are
+fitted to the episodes first (behaviour cloning), and training continues from there (Rajeswaran et
+al. 2018). In both cases the episodes count as environment steps, so that learning curves include
+them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -65,7 +66,7 @@ class Demonstrations(BaseCallback):
     def _on_training_start(self) -> None:
         model = self.model
         if model.num_timesteps > 0:
-            return  # a resumed run has them already
+            return  # a resumed run has already used the episodes
         if isinstance(model, OnPolicyAlgorithm):
             self._clone(model)
         elif isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
@@ -124,7 +125,7 @@ class Demonstrations(BaseCallback):
 def _returns(steps: Sequence[_Step], gamma: float) -> list[NDArray[Any]]:
     """Return the discounted sum of rewards (n,) from each step on.
 
-    The last reward of an episode counts as repeated for ever, since only a time limit ends it.
+    The last reward of an episode is assumed to continue for ever, since only a time limit ends it.
     """
     found: list[NDArray[Any]] = []
     total = np.zeros(0)

@@ -20,8 +20,8 @@ from tpm_gym.learning.rollout import GoalEnv
 def import_module_of(env_id: str) -> None:
     """Import the module of an id ``module:id`` that the user has typed; do nothing for other ids.
 
-    The module may be a file of the working folder. Ids from files must not come here: a module runs
-    any code when it is imported.
+    The module may be a file of the working folder. Do not call this function with an id that was
+    read from a file: importing a module runs its code.
     """
     module = env_id.rpartition(":")[0]
     if not module:
@@ -68,8 +68,8 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
 
     Args:
         env: An id, or its registration, which another process may not have.
-        in_worker: Whether this is a worker process. A terminal signals all processes, and a worker
-            must outlive the signal until the main process has saved.
+        in_worker: Whether this is a worker process. Ctrl-C reaches all processes of a terminal. A
+            worker ignores it, so that the main process can still save.
     """
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):

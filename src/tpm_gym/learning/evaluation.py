@@ -64,7 +64,7 @@ class EvaluationConfig:
     """Episodes of each policy."""
 
     seed: int = TEST_SEED
-    """Seed of the first episode. Training and selection use smaller ones than the default."""
+    """Seed of the first episode. Training and selection use seeds below the default."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
     """Goals: sampled everywhere, or only next to the singularity (tempting)."""
@@ -134,7 +134,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     config = _complete(config)
     count = min(config.episodes, BATCH) if config.env_options.in_batches else 1
     with closing(_make_envs(config, count)) as envs:
-        # All are loaded before the first one runs, so that a mistyped name shows at once.
+        # All policies are loaded before the first one runs, so that a mistyped name fails at once.
         policies = list(zip(config.policy, _load(config, envs), strict=True))
         results = [_evaluate_one(envs, *policy, config, console) for policy in policies]
     console.print(_table(config, results))
@@ -190,7 +190,10 @@ def _common(option: str, values: Mapping[str, Any]) -> Any:
 
 
 def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of machine, engine and drive, by default the id's, and a shield, if any."""
+    """Return the names of machine, engine and drive, and the shield if one is given.
+
+    A name that is not given is the id's.
+    """
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     if given.get("shield"):
         usual["shield"] = ""
@@ -286,7 +289,7 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 
 def _film(config: EvaluationConfig, console: Console) -> None:
-    """Repeat the first episodes with rendering, so that it does not slow the evaluation."""
+    """Repeat the first episodes with rendering, which would slow the evaluation itself."""
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:

@@ -1,4 +1,4 @@
-"""Pictures of a policy at work: a video of episodes, a contact sheet of one."""
+"""Pictures of a policy at work: a video of several episodes, a contact sheet of one episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Provenance of a result (versions, commit, machine, command), and files that are written whole."""
+"""Provenance of a result (versions, commit, machine, command); writing files in one step."""
 
 import json
 import os
@@ -61,7 +61,7 @@ def git_commit() -> str | None:
 
 
 def machine() -> dict[str, Any]:
-    """Return the properties of the computer that decide its speed; nothing that identifies it."""
+    """Return the properties of the computer that decide its speed, and none that identify it."""
     processor = platform.processor()
     with suppress(OSError, IndexError):  # on most Linux systems the above is empty
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
@@ -94,7 +94,7 @@ def _portable(word: str) -> str:
 
 
 def require_packages(extras: Mapping[str, str]) -> None:
-    """Refuse to start without a package that is needed later; ``extras`` install the packages."""
+    """Raise MissingPackageError if a package is missing; ``extras`` maps packages to extras."""
     for package, extra in extras.items():
         if find_spec(package) is None:
             raise MissingPackageError(package, extra)

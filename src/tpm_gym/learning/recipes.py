@@ -59,9 +59,9 @@ class Recipe:
         """Return keyword arguments of the algorithm's constructor, with classes for names.
 
         Args:
-            update: Part of the training between two updates, from 0 to 1. A learning rate that
-                falls to zero is zero one such part after the last update. With 0, as in
-                Stable-Baselines3, the rate is zero in the last update, which changes nothing.
+            update: Steps between two updates, as a fraction of all steps. A falling learning rate
+                would reach zero one interval after the last update. With 0, as in
+                Stable-Baselines3, it is zero in the last update, which then changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):
@@ -104,7 +104,9 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 
 
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
-    """Return the first algorithm by name with a recipe for an id, or else with one that it may use.
+    """Return the alphabetically first algorithm with a recipe for an id.
+
+    If there is none, return the first one with a recipe that the id may use, or else ``"sac"``.
 
     Args:
         env_id: ``id`` or ``module:id``.
@@ -113,7 +115,7 @@ def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = No
     """
     found = {}
     for algorithm in sorted(ALGORITHMS):
-        with suppress(ConfigError):  # complete() reports it for the chosen one
+        with suppress(ConfigError):  # complete() raises it again for the chosen algorithm
             recipe = read_recipe(path or recipe_file(algorithm, engine), algorithm, env_id)
             found[algorithm] = recipe.written_for
     own = [algorithm for algorithm, name in found.items() if name == env_id.rpartition(":")[2]]
@@ -121,7 +123,7 @@ def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = No
 
 
 def shipped_for(env_id: str) -> list[str]:
-    """Return options of a training with which there is a shipped recipe for an id."""
+    """Return the options of ``tpm-gym train`` that select the shipped recipes for an id."""
     found = []
     for file in sorted(RECIPES.glob("*.yml"), key=lambda file: file.stem):
         algorithm, _, engine = file.stem.partition("-")
@@ -189,7 +191,7 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
-    """Check recipes, name -> entries."""
+    """Raise ConfigError if recipes (name -> entries) have an unknown key or an invalid value."""
     entries = ALGORITHMS[algorithm].entries()
     kind: Any = dict[str, entries]  # type: ignore[valid-type]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)

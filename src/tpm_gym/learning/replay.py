@@ -1,8 +1,8 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
 The algorithm is that of ``tpm-gym train`` without ``--algo``. The policy acts as in training, with
-its exploration. Episodes are spread evenly over the steps of the training after its demonstrations;
-they have seeds of their own and change nothing about the training.
+its exploration. Episodes are spread evenly over the steps of the training after its demonstrations.
+They have seeds of their own and do not affect the training.
 """
 
 from collections.abc import Callable, Iterator
@@ -67,7 +67,7 @@ def episodes(
         options: Options of the environments.
         count: Number of episodes, spread evenly over the moments.
         seed: Seed of the training, and of the first episode.
-        steps: Steps of the training; UNSET for those of the recipe.
+        steps: Steps of the training; UNSET for the recipe's number.
         record: Called with environments, policy, number of episodes and first seed.
     """
     config = complete(TrainingConfig(env=env, seed=seed, steps=steps, env_options=options))

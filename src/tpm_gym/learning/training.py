@@ -75,7 +75,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     console = console or Console()
     import_module_of(config.env)
     check_env_id(config.env)
-    with closing(make_env(**config.env_arguments)) as env:  # refused before all else
+    with closing(make_env(**config.env_arguments)) as env:  # wrong options fail here, before all
         size = flatdim(env.observation_space)
     asked, config = config.steps, complete(config)
     asked = config.recipe.n_timesteps if asked is UNSET else asked
@@ -173,7 +173,7 @@ def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str,
 
 @contextmanager
 def _foreign_named(run: Path) -> Iterator[None]:
-    """Raise an error of a checkpoint with a right sum, and entries that no training writes."""
+    """Convert errors of a checkpoint whose checksum is right, but whose entries are not."""
     try:
         yield
     except TPMError:
@@ -233,7 +233,7 @@ class _Session:
         """Set model, files and logs to the beginning or the checkpoint.
 
         Returns:
-            Time of the training until now, s, and its evaluations.
+            Training time so far, s, and the evaluations so far.
         """
         config, content, seconds, evaluations = self.config, self.content, 0.0, []
         if content is None:
@@ -256,7 +256,7 @@ class _Session:
     def _learn(
         self, model: BaseAlgorithm, called: list[BaseCallback], listener: SignalListener
     ) -> signal.Signals | None:
-        """Take the steps that are left; return the signal that stopped it."""
+        """Train for the remaining steps; return the signal that stopped the training, or None."""
         steps = self.config.steps - model.num_timesteps
         try:
             model.learn(steps, callback=called, reset_num_timesteps=self.content is None)
@@ -360,7 +360,7 @@ def _require_room(config: TrainingConfig, numbers: int) -> None:
     size = config.argument("buffer_size") or config.rollout
     try:
         np.empty((size, 2, numbers), np.float32)
-    except (MemoryError, ValueError) as error:  # beyond all addresses it is a ValueError
+    except (MemoryError, ValueError) as error:  # ValueError: larger than the address space
         raise ConfigError(f"--recipe {config.recipe_file}: {name} {size}: {error}") from error
 
 
@@ -391,7 +391,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
     """Build the training environments: in processes, or together in the analytic engine."""
     several = config.envs > 1
     if several and config.env_options.in_batches:
-        # Episodes that end one by one make the batches of an on-policy algorithm even.
+        # Episodes that end at different steps give an on-policy batch all parts of an episode.
         options = {**config.env_arguments, "autoreset_mode": "SameStep", "stagger": True}
         envs = AnalyticVecEnv(make_envs(count=config.envs, **options))
         envs.seed(config.seed)

@@ -40,7 +40,8 @@ RECIPE_FILE: Final = "recipe.yml"
 """File of the best recipe in the folder of a search; give it to ``train --recipe``."""
 
 _MOST_JOBS: Final = 10_000
-_SHARED: Final = ("algo", "env", "steps", "env_options", "randomisation")  # with TrainingConfig
+# Options that TuneConfig and TrainingConfig have in common.
+_SHARED: Final = ("algo", "env", "steps", "env_options", "randomisation")
 
 _SPACE: Final[Mapping[str, Sequence[float]]] = {
     "learning_rate": (0.0003, 0.0006, 0.001, 0.002, 0.003),
@@ -152,14 +153,15 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
 
 @contextmanager
 def _started(ray: Any, jobs: int | None) -> Iterator[None]:
-    """Start Ray on this computer, or join the cluster at RAY_ADDRESS, unless that is done."""
+    """Start Ray on this computer or join the cluster at RAY_ADDRESS, unless Ray runs already."""
     if ray.is_initialized():
         yield
         return
     address = os.environ.get("RAY_ADDRESS")
     quiet = {"include_dashboard": False, "log_to_driver": False}
     try:
-        # "local": not a cluster of others that runs here. Ray refuses a number of CPUs for one.
+        # "local" never joins a cluster of others on this computer. For the cluster at RAY_ADDRESS,
+        # Ray refuses num_cpus.
         ray.init(**quiet) if address else ray.init("local", num_cpus=jobs, **quiet)
     except ConnectionError as error:
         raise ConfigError(f"RAY_ADDRESS {address}: {error}; start Ray there") from error

@@ -168,7 +168,7 @@ class Policy:
 
 
 def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tuple[int, ...]]:
-    """Return an entry of an observation as (n, size), in float32 precision; and its batch axes."""
+    """Return an entry of an observation as (n, size), rounded to float32, and its batch shape."""
     values = numbers(name, value)
     batch = values.shape[: values.ndim - len(shape)]
     if values.shape != batch + shape or len(batch) > 1:
@@ -185,7 +185,7 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
 def _control(env: Any) -> str | None:
     """Return the name of an environment's control; None if it is not of tpm_gym."""
     own = getattr(env, "unwrapped", env)
-    # Gymnasium's SyncVectorEnv has a list of environments, and no method that is safe to ask.
+    # Gymnasium's SyncVectorEnv has a list of environments, and no method that is safe to call here.
     first = next(iter(getattr(own, "envs", [])), own)
     control = getattr(getattr(first, "unwrapped", first), "control", None)
     if hasattr(env, "has_attr") and env.has_attr("control"):

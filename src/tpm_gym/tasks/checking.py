@@ -1,4 +1,4 @@
-"""Check of a task: it starts, with equal results for states together and one by one."""
+"""Check of a task: it can start, and computes equal results for states in a batch and alone."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _OWN_ROW = (
 
 
 def check(task: Task, taken: Sequence[str] = ()) -> None:
-    """Check that a task has starts, and equal results for states together and one by one.
+    """Check that a task can start, and computes equal results for states in a batch and alone.
 
-    Not every machine has tempting goals, or room for a task. And a method that reduces over the
-    robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns, gives wrong
-    rewards in vector environments without an error.
+    A task cannot start if the machine has no tempting goals, or no room for the task. A method that
+    reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns,
+    gives wrong rewards in vector environments without an error.
 
     Args:
         taken: Names that no event may have.
 
     Raises:
-        ConfigurationError: If there is no start, an attribute is not possible, an event's name is
+        ConfigurationError: If the task cannot start, an attribute is not valid, an event's name is
             taken, or a result is wrong; the error names the attribute or the method.
     """
     known = list(taken)

@@ -82,7 +82,7 @@ class Expert:
         return actions[0] if self._alone else actions
 
     def _look(self, observation: dict[str, Any]) -> None:
-        """Show each plan its robot, and begin the plans of new episodes."""
+        """Give each plan the observation of its robot, and start the plans of new episodes."""
         seen = self._task.decode(np.atleast_2d(observation["observation"]))
         goals = np.atleast_2d(np.asarray(observation["desired_goal"], dtype=np.float64))
         episodes = np.atleast_1d(self._env.episode)

@@ -25,7 +25,7 @@ ROUNDING = 1e-5
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
 SLOW_ABOVE = CUP.seal_gap + 0.001
-"""Height of the lip over a block from where a gentle pick goes on slowly, m."""
+"""Height of the lip over a block below which a gentle pick moves slowly, m."""
 SLOW_SPEED = 0.025
 """Speed of a gentle pick below that height, m/s."""
 
@@ -80,10 +80,10 @@ class Motion:
         return bool(self._see(name, "held")[0] > 0.5)
 
     def carried_to(self, place: FloatArray, name: str | None = None) -> FloatArray:
-        """Return P (3,) m, machine's frame, that has the held object's centre at ``place`` (world).
+        """Return P (3,) m, machine's frame, for the held object's centre to be at ``place``.
 
-        The cup does not hold an object exactly at its middle. Name and errors are as in
-        :meth:`holding`.
+        ``place`` is (3,) m, world frame. The cup does not hold an object exactly at its middle.
+        Name and errors are as in :meth:`holding`.
         """
         grip = self.seen["position"] - self._see(name, "position")
         return self.machine.mount.to_paper(place + grip)
@@ -135,7 +135,7 @@ class Motion:
         """
         start, place = self.command, target()
         way = place + above - step - start
-        # The way relative to the target is longer, as far as P needs a part of its speed to follow.
+        # Following the target needs a part of P's speed, so that the relative way takes longer.
         spare = 1 - np.abs(step) / self._reach
         across = self.trapezoid(start, start + way / spare)
         for done, down in self._overlapped([across, self.trapezoid(place + above, place)]):
@@ -161,7 +161,7 @@ class Motion:
         Args:
             block: The block.
             clearance: Height over the block from where P comes down, m.
-            gently: Whether P comes to rest above the block, and goes on slowly until the cup seals.
+            gently: Whether P stops above the block, and then comes down slowly until the cup seals.
                 Otherwise it presses the block on the table.
 
         Raises:

@@ -51,9 +51,9 @@ class Throw(Task):
 
     The goals lie on the table outside the workspace, 40 to 150 mm beyond either end of the
     machine's region along x, as far as its table and its speed allow. The block is slippery: at a
-    speed v it slides v^2 / (2 mu g), with mu = 0.1 against the table. The goal is achieved where
-    the centre of the block is within 20 mm of it. With ``goals="tempting"``, the way on which P
-    runs up, lets go and stops is only just safe.
+    speed v it slides v^2 / (2 mu g), with mu = 0.1 against the table. The goal is achieved if the
+    centre of the block is within 20 mm of it. With ``goals="tempting"``, the path on which P runs
+    up, lets go and stops is only just safe.
     """
 
     block = Block(friction=0.1)

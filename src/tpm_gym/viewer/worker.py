@@ -36,7 +36,7 @@ class Worker:
             self._change.notify_all()
 
     def ask(self, name: str, job: Job) -> None:
-        """Run a job for a user's input; ignore a control's value that a job has set."""
+        """Run a job for a user's input; ignore an update that a job of this thread caused."""
         if threading.current_thread() is not self._thread:
             self.put(name, job)
 

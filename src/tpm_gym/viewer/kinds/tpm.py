@@ -169,7 +169,7 @@ class TPMKind(Kind):
     def margin(self, posture: Posture) -> Margin | None:
         """Find the nearest singular position of P.
 
-        The search takes 5 to 10 ms, unlike the solution of a posture.
+        The search takes 5 to 10 ms, longer than solving a posture.
         """
         modes = posture.working, posture.assembly
         found = nearest_singularity(posture.position, *modes, self.machine.geometry)
@@ -179,7 +179,7 @@ class TPMKind(Kind):
 
 
 def _slot(found: kinematics.RotatedPostures, slot: int) -> kinematics.RotatedPostures:
-    """Return the posture in one slot."""
+    """Return the posture at index ``slot``."""
     theta, link3, tilt, beta = found.theta[slot], found.link3[slot], found.tilt[slot], found.beta
     return kinematics.RotatedPostures(theta, link3, tilt, beta[slot], found.geometry)
 
