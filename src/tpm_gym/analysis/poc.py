@@ -145,8 +145,9 @@ def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = F
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four spherical pairs, the paper's P^(4S) P^(4S) R^(4S) R^(4S).
 
-    The far short link, with its middle at ``point`` (3,) m, can neither translate along the rods
-    nor rotate about the normal of the directions ``short`` (3,) of the links and ``rod`` (3,).
+    ``short`` (3,) is the direction of the short links, ``rod`` (3,) that of the rods. The far short
+    link, with its middle at ``point`` (3,) m, cannot translate along ``rod``, nor rotate about the
+    normal of ``short`` and ``rod``.
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])

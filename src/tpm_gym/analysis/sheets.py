@@ -1,9 +1,10 @@
-"""Singular surfaces as curves of C1 that link 7 sweeps, and the nearest points on them.
+"""Singular surfaces, each swept by link 7 along a curve of C1, and the nearest points on them.
 
-The factors level3, planar, leg 1, leg 2 and elevation depend on xC and zC alone. So each is zero on
-a curve of C1 in the plane y = 0, and P is on a circle of radius l7 about (xC + l2, 0, zC + 2 l6),
-parallel to xy. Each curve has a closed form over one angle, so the distance to a surface is a
-minimum over one angle. A curve consists of arcs, intervals of the angle in which it is real.
+The singularity factors level3, planar, leg 1, leg 2 and elevation depend on xC and zC alone. So
+each is zero on a curve of C1 in the plane y = 0, and P is on a circle of radius l7 about (xC + l2,
+0, zC + 2 l6), parallel to xy. Each curve has a closed form over one angle, so the distance to a
+surface is a minimum over one angle. A curve consists of arcs, intervals of the angle in which it is
+real.
 """
 
 from __future__ import annotations
@@ -154,11 +155,11 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
 
 
 def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
-    """Return the curves of C1 on which a factor is zero, m in number, in 256 steps each, (m, 257).
+    """Return the curves of C1 on which a factor is zero: k curves of 256 steps, (k, 257).
 
     Args:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
-        mode: The working mode. Points that belong to others are included; see :data:`Point`.
+        mode: The working mode. Points of other working modes are included; see :data:`Point`.
         geometry: Link lengths.
     """
     return _arcs(geometry, mode, factor)[1]

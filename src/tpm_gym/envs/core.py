@@ -508,7 +508,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
 
 
 def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
-    """Refuse arrays that are no batch of goals; goals that are not finite count as no success."""
+    """Refuse arrays without the shapes of goals; goals that are not finite are failures."""
     shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
     try:
         np.broadcast_shapes(*shapes)

@@ -42,7 +42,8 @@ TOLERANCE = 2e-5
 The check of a path demands half of it; the other half is for errors between the nodes.
 """
 _FAR = 1.05
-"""Factor of ``least``; the path between three commands with more conditioning is safe."""
+"""Ratio to ``Shield.least`` of the conditioning at three successive commands, from which on the
+path between them is safe without a check."""
 _STEPS = 6  # largest number of steps of sequential quadratic programming
 _CLOSE = 0.005  # step, in units of the action, that ends the search: the next is 100 times smaller
 _ROUNDS = 3  # largest number of times that the aim is raised, if a path is less safe than its ends

@@ -326,7 +326,7 @@ def refuses_bad_options_and_keeps_the_episode_then(make: Make) -> None:
 
 
 def refuses_steps_outside_an_episode(make: Make) -> None:
-    """Use an environment before its first reset, and after it was closed."""
+    """Check that steps before the first reset and after close() are refused."""
     bare: Any = make().unwrapped
     action: NDArray[Any] = np.zeros(bare.action_space.shape)
     for call in (lambda: bare.step(action), lambda: bare.state, bare.save_state):

@@ -76,9 +76,10 @@ class RotatedMode(_Mode):
     Attributes:
         planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: the side on
             which rod 6 passes the point where rods 4a and 4b cross, as seen along y. Where rods 4
-            appear shorter than links 3, -1 is the half with the smaller factors.
-        further: Of the two assemblies of link 3' with that sign, -1 for the smaller tilt and 1 for
-            the larger one, from 0 to 2 pi.
+            appear shorter than links 3, -1 names the two assemblies of link 3' with the smaller
+            factors.
+        further: -1 for the smaller and 1 for the larger tilt phi of the two assemblies of link 3'
+            with this sign; phi is in [0, 2 pi).
         sin_beta: Sign of sin(beta), and so of y.
     """
 

@@ -31,8 +31,8 @@ class Namespace:
         arccos: Arccosine of the clipped number.
         arcsin: Arcsine of the clipped number.
         cos_third: Cosine of a third of the arccosine of the clipped number.
-        positive: Angle in [0, 2 pi) of one in [-pi, pi].
-        signs: -1 and 1, in a given shape and as numbers like a given one.
+        positive: Convert an angle in [-pi, pi] to [0, 2 pi).
+        signs: Return -1 and 1 in a given shape, with the type of a given number.
         stack: Join components (...,) along a new last axis.
         join: Broadcast points (..., 3), and join them along their last axis.
         solve: Solve linear systems (..., k, k) for right sides (..., k).

@@ -101,7 +101,7 @@ class Algorithm:
         return given.get(name, parameters[name].default if name in parameters else None)
 
     def entries(self) -> Any:
-        """Return the type of a recipe: entries that algorithm and policy have as arguments."""
+        """Return the type of a recipe: its keys are arguments of the algorithm and its policy."""
         kind: Any = self.load_class()
         arguments = inspect.signature(kind).parameters
         policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters

@@ -354,7 +354,7 @@ def digest(data: Path, episodes: int | None = None) -> str:
 
 
 def _update(total: Any, arrays: Mapping[str, Any]) -> None:
-    """Add arrays, whose names may be nested, to a digest."""
+    """Add arrays to a digest; mappings may be nested."""
     for name, value in sorted(arrays.items()):
         total.update(name.encode())
         if isinstance(value, Mapping):

@@ -279,7 +279,7 @@ def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[st
 
 
 def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
-    """Return one path per policy; several policies have their names in them."""
+    """Return one path per policy; with several policies, each file name contains the policy's."""
     if len(policies) == 1:
         return [path]
     names = [Path(spec).stem for spec in policies]

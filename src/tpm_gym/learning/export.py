@@ -240,7 +240,7 @@ def _box(space: spaces.Space[Any]) -> dict[str, Any]:
 
 
 def _write(path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgorithm) -> Path:
-    """Write both files under other names, verify them, and rename them."""
+    """Write both files to a temporary folder, verify them, and move them to their place."""
     json_file, weights_file = files(path)
     json_file.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=json_file.parent, prefix=".export-") as folder:

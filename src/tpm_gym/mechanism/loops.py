@@ -35,7 +35,8 @@ _NONE: Final = (0.0, 0.0, 0.0)
 class Equations(NamedTuple):
     """Functions of one mechanism that the loops call; all of them are compilable.
 
-    Each attribute is given as (arguments) -> results. ``rates`` and ``changes`` are the first and
+    Each attribute is given as (arguments) -> results. ``columns`` are lengths and constants of the
+    machines, whose row j is computed. ``rates`` and ``changes`` are the first and
     second derivatives of the joint positions by time.
 
     Attributes:

@@ -314,7 +314,7 @@ def friction_force(
 
 @compiled
 def _at_most(vector: Vector, most: float) -> Vector:
-    """Shorten a vector to the length ``most`` if it is longer; negative is taken as 0."""
+    """Shorten a vector to the length ``most`` if it is longer; a negative ``most`` is 0."""
     share = min(1.0, max(most, 0.0) / max(length(vector), 1e-12))
     return plus((0.0, 0.0, 0.0), vector, share)
 

@@ -171,7 +171,7 @@ class Cycle(Task):
         return goal
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the two ends, at any depth."""
+        """Return a box for each end, low and high corner (3,) m, world; it spans all depths."""
         del block
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []
@@ -181,7 +181,7 @@ class Cycle(Task):
         return boxes
 
     def departures(self, goals: FloatArray) -> FloatArray:
-        """Return the other ends."""
+        """Return the end opposite to each goal, (r, 3) m, machine's frame."""
         points: FloatArray = self.machine.mount.to_paper(goals).copy()
         points[:, 0] = self._ends.sum() - points[:, 0]
         return points

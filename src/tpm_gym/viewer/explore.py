@@ -177,13 +177,13 @@ class Explore:
 
 
 def units(machine: Machine) -> list[tuple[float, str]]:
-    """Return, for each motor, the factor from rad or m to the panel's unit, and its name."""
+    """Return the factor from rad or m to the panel's unit, and the unit, for each motor."""
     of_motor = {"rad": (math.degrees(1.0), "°"), "m": (1000.0, "mm")}
     return [of_motor[motor.unit] for motor in machine.mechanism.motors]
 
 
 def _fill(handle: Any, label: tuple[str, str], options: Iterable[str]) -> None:
-    """Give a list another label, explanation and options."""
+    """Change label, explanation and options of a drop-down list."""
     (handle.label, handle.hint), handle.options = label, tuple(dict.fromkeys(options))
 
 

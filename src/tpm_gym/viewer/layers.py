@@ -50,7 +50,7 @@ class Layers:
 
     Args:
         scene: Scene of a viser server.
-        kind: The robot.
+        kind: Layers of the machine's class.
     """
 
     def __init__(self, scene: SceneApi, kind: Kind) -> None:
@@ -180,4 +180,4 @@ LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
     ),
     "margin": ("Margin", "Way from P to the nearest singularity", Layers._margin),
 }  # fmt: skip
-"""Layers by name: label, explanation, and a function that draws what a kind has found."""
+"""Layers by name: label, explanation, and a function that draws the layer of a machine."""

@@ -108,7 +108,7 @@ class Player:
         self._rng = np.random.default_rng()
 
     def _load(self, policy: str) -> Callable[[Any], Any]:
-        """Return a function that acts on an observation."""
+        """Return a function from an observation to the action."""
         if policy == "random":
             return self._draw
         if policy == "expert":

@@ -419,7 +419,7 @@ def _scales(
 
 
 def _along(x: float, y: float) -> tuple[float, float]:
-    """Return the scales whose corner of the box lies on the cone along (x, y)."""
+    """Return scales for which a corner of the friction box is on the cone along (x, y)."""
     length = max(math.hypot(x, y), 1e-12)
     return max(abs(x) / length, _LEAST), max(abs(y) / length, _LEAST)
 

@@ -160,7 +160,7 @@ def _copy(tables: Tables, copy: Tables, row: int) -> None:
 
 @compiled
 def _place(path: Route, i: int, setting: Setting, points: FloatArray) -> None:
-    """Write point P (m, world) before and at the beginning, and after each time step."""
+    """Write P (m, world) one time step before the path, at its beginning, and after each step."""
     turn, origin = setting.turn, setting.origin
     put_row(points, 0, _placed(row_of(path.before, i), turn, origin))
     put_row(points, 1, _placed(row_of(path.now, i), turn, origin))
