@@ -235,5 +235,10 @@ def _velocity(c: _Configuration) -> Numbers:
 
 def _conditioning(c: _Configuration) -> Numbers:
     """Compute the conditioning, and 0 where J does not exist."""
-    found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
-    return c.ns.where(found <= 1.0, found, 0.0)
+    values, ns = c.factors, c.ns
+    exists = abs(values.planar * values.sin_beta * values.level3) > equations.LEAST
+    # Otherwise, the derivatives of all rows by the lengths would be NaN.
+    sin_beta, level3, planar = (ns.where(exists, value, 1.0) for value in values[:3])
+    values = values._replace(sin_beta=sin_beta, level3=level3, planar=planar)
+    found = equations.conditioning(equations.velocity(c.rods, values), ns)
+    return ns.where(exists & (found <= 1.0), found, 0.0)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite_points
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics.equations import Triple, leg_margin
+from tpm_gym.kinematics.equations import LEAST, Triple, leg_margin
 from tpm_gym.kinematics.equations import arms as arms_at
 from tpm_gym.kinematics.equations import conditioning as conditioning_of
 from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, by_rows
@@ -80,7 +80,7 @@ def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) 
     def text(angles: Triple, ns: Namespace) -> list[Numbers]:
         pose, real = pose_at(angles, side, geometry, ns)
         real = real & regular(pose, geometry)
-        return [tuple(_or_nan(real, row, ns) for row in velocity(pose))]
+        return [tuple(_or_nan(real, row, ns) for row in velocity(_regular(pose, real, ns)))]
 
     return by_rows(text, finite_points("theta", theta))[0]
 
@@ -124,7 +124,9 @@ def conditioning_at(
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
         pose, real = _pose_at(point, bends, geometry, ns)
-        return list(_or_nan(real, (conditioning_of(velocity(pose), ns),), ns))
+        exists = abs(pose.parallel) > LEAST
+        found = conditioning_of(velocity(_regular(pose, exists, ns)), ns)
+        return list(_or_nan(real, (ns.where(exists, found, 0.0),), ns))
 
     return by_rows(text, finite_points("position", position))[0]
 
@@ -161,6 +163,11 @@ def no_assembly(
     if not regular(pose, geometry):
         return SingularityError("det A (the rods are coplanar)", float(pose.parallel))
     return UnreachableError(theta, "working mode", 0.0, "choose joint angles of the working mode")
+
+
+def _regular(pose: Pose, regular: Numbers, ns: Namespace) -> Pose:
+    """Replace det A where J does not exist, or the derivatives by the lengths would be NaN."""
+    return pose._replace(parallel=ns.where(regular, pose.parallel, 1.0))
 
 
 def _or_nan(real: Numbers, values: tuple[Numbers, ...], ns: Namespace) -> tuple[Numbers, ...]:
