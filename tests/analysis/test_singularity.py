@@ -267,7 +267,7 @@ def test_points_that_are_none_are_masked_in_batches():
 def test_bad_input_is_refused():
     theta = inverse(HOME)
     for function in (singularity.classify_at, singularity.classify, nearest_singularity):
-        for wrong in ([0.0, 0.0], 1.0):
+        for wrong in ([0.0, 0.0], 1.0, "abc", ["1", "2", "3"], [[1.0], [2.0, 3.0]], [10**400] * 3):
             with pytest.raises(InputError):
                 function(wrong)
     with pytest.raises(InputError):
@@ -278,7 +278,7 @@ def test_bad_input_is_refused():
     ):
         with pytest.raises(UnreachableError):
             function([good, unreachable])
-        for tolerance in (0.0, -1e-6, 1.0, float("nan")):
+        for tolerance in (0.0, -1e-6, 1.0, float("nan"), "0.1"):
             with pytest.raises(ConfigurationError) as caught:
                 function(good, tolerance=tolerance)
             assert caught.value.name == "tolerance"
