@@ -124,6 +124,7 @@ class Core:
         self.machine = self.task.machine
         self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
+        self.randomisation.require_fitting(self.machine)
         self._altered = self.randomisation != Randomisation()
         self._follower = self._make_follower()
         self._shield = None if shield is False else self._make_shield(shield)
