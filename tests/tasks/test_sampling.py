@@ -138,6 +138,11 @@ def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind):
     assert share.max() < 0.6
 
 
+def test_every_episode_starts_where_one_draw_of_some_300_fits():
+    narrow = replace(PAPER_TPM, safe_conditioning=0.22, home=(-0.04, 0.04, 0.8))
+    Stack(narrow).start([np.random.default_rng(seed) for seed in range(50)])
+
+
 def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for_ever():
     rngs = [np.random.default_rng(0)]
     with pytest.raises(ConfigurationError, match="'sampled': on 'wide'") as caught:

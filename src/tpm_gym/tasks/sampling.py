@@ -80,8 +80,9 @@ def safe_points(
     boxes = np.array([(box.low, box.high) for part in parts for box in part]).reshape(-1, 2, 3)
     counts = np.array([len(part) for part in parts], dtype=np.int64)
     least, most = _limits(machine, near_singularity)
-    shares = np.empty((len(rngs), len(parts), _BATCH if near_singularity else _DRAWS, 4))
-    for _ in range(_ATTEMPTS):
+    size = _BATCH if near_singularity else _DRAWS
+    shares = np.empty((len(rngs), len(parts), size, 4))
+    for _ in range(_ATTEMPTS * _BATCH // size):
         # One call for each generator, because a call takes longer than the numbers.
         for row, own in zip(rows.tolist(), shares, strict=False):
             rngs[row].random(out=own)
