@@ -72,7 +72,7 @@ def test_the_camera_shows_the_block_as_many_steps_late_as_stated():
 def test_impossible_options_of_the_belt_are_refused():
     task = Conveyor(PAPER_TPM)
     rngs = [np.random.default_rng(0)]
-    for speed in (1.5, np.nan, [0.1, 0.1], "fast"):
+    for speed in (1.5, np.nan, [0.1, 0.1], "fast", [[0.1], [0.1, 0.2]]):
         with pytest.raises(ResetOptionError, match="belt_speed"):
             task.start(rngs, {"belt_speed": speed})
     with pytest.raises(UnreachableError):  # the place is in the tray

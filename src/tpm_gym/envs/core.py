@@ -203,7 +203,7 @@ class Core:
             UnreachableError: If an object or the goal is out of reach; nothing has happened then.
         """
         self.require_open()
-        before = [rng.bit_generator.state for rng in rngs] if options else []
+        before = [rng.bit_generator.state for rng in rngs] if options is not None else []
         try:
             starts = self.task.start(rngs, options)
         except BaseException:
@@ -501,7 +501,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
         else:
             others = [float(_goal_free(entry.get("reward_terms", {}))) for entry in info]
             other = np.array(others).reshape(goal_term.shape)
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
         valid = f"a step's info, or one for each of the {goal_term.size} transitions"
         raise InputError("info", type(info), valid) from error
     total = goal_term + other
