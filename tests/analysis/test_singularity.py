@@ -8,7 +8,7 @@ import pytest
 from examples import examples
 from hypothesis import strategies as st
 
-from tpm_gym.analysis import singularity
+from tpm_gym.analysis import sheets, singularity
 from tpm_gym.analysis.singularity import FACTORS, SingularityType, nearest_singularity
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
@@ -282,3 +282,11 @@ def test_bad_input_is_refused():
             with pytest.raises(ConfigurationError) as caught:
                 function(good, tolerance=tolerance)
             assert caught.value.name == "tolerance"
+
+
+def test_curves_serve_all_callers_and_cannot_be_changed():
+    x, *_ = sheets.curves("leg1", ELBOWS_OUT, PAPER)
+    with pytest.raises(ValueError, match="read-only"):
+        x += 1.0
+    with pytest.raises(InputError, match="level3, planar, leg1"):
+        sheets.curves("leg3", ELBOWS_OUT, PAPER)

@@ -15,6 +15,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from tpm_gym.arrays import FloatArray, IntArray
+from tpm_gym.errors import InputError
 from tpm_gym.kinematics.equations import Factors
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
@@ -150,6 +151,8 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
     points = arcs.at(np.arange(len(rows)), np.broadcast_to(t, (len(rows), len(t))))
     chords = np.hypot(*np.diff(points[:2])).reshape(len(rows), _CELLS, -1)
     x, z, p, q = (part[:, :: _FINE // _CELLS] for part in points)
+    for part in (x, z, p, q):
+        part.flags.writeable = False  # they serve all callers
     return arcs, (x, z, p, q), chords.sum(-1)
 
 
@@ -160,7 +163,12 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
         mode: The working mode. Points that belong to others are included; see :data:`Point`.
         geometry: Link lengths.
+
+    Raises:
+        InputError: If no curve belongs to a factor of this name.
     """
+    if factor not in _CURVES:
+        raise InputError("factor", factor, f"one of {', '.join(_CURVES)}")
     return _arcs(geometry, mode, factor)[1]
 
 

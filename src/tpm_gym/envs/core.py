@@ -156,6 +156,7 @@ class Core:
         self._pending = np.zeros((self.randomisation.latency, count, self.task.action_size))
         # Objects in the last control steps, oldest first, if the camera is late
         self._views = np.zeros((self.task.camera_delay, count, len(self.task.scene.objects), 9))
+        self._newest = self._views[:1]  # a copy, as users may change arrays of the state
         self.simulation = self._start()
 
     def _make_shield(self, shield: bool | float) -> Shield | BrakingShield:
@@ -250,7 +251,7 @@ class Core:
             commands = self._shield.command(commands, simulation.recent)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
         if len(self._views):
-            self._views = np.concatenate([self._views[1:], _view(simulation.state())[None]])
+            self._views = np.concatenate([self._views[1:], self._newest])
         self._state = None
         noisy = self.randomisation.encoder_noise > 0
         simulation.move(commands, vacuum, self._noise(running) if noisy else None)
@@ -265,7 +266,7 @@ class Core:
         state, goals = self.simulation.state(), self.goals
         self._state = seen = state
         if len(self._views):
-            seen = _seen(state, self._views[0])
+            seen, self._newest = _seen(state, self._views[0]), _view(state)[None]
         if rows is not None:
             state, seen, goals = state.take(rows), seen.take(rows), goals[rows]
         task = self.task
@@ -366,6 +367,7 @@ class Core:
         """Return a snapshot; :attr:`state` is that of the restarted simulation then."""
         snapshot = self.simulation.save()
         self._state = self.simulation.state()
+        self._newest = _view(self._state)[None]
         return snapshot
 
     def restore(self, snapshot: Any) -> Observation:

@@ -6,6 +6,7 @@ Everything here is in the paper frame, in metres, on one working mode.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,8 +52,12 @@ class Region:
 
     def project(self, points: ArrayLike) -> FloatArray:
         """Return the nearest points of the box to points (..., 3)."""
-        array = _points("points", numbers("points", points))
-        return np.minimum(np.maximum(array, self.low), self.high)
+        array: Any = points
+        plain = type(points) is np.ndarray and points.dtype.char == "d"  # the common case, fast
+        if not plain or array.shape[-1:] != (3,):
+            array = _points("points", numbers("points", points))
+        nearest: FloatArray = np.minimum(np.maximum(array, self.low), self.high)
+        return nearest
 
     def corners(self) -> Iterator[Vector]:
         """Yield the eight corners, m."""

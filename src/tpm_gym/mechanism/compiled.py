@@ -178,7 +178,8 @@ def _loops_of(module: str) -> Any:
 
 def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:
     """Convert vectors (..., length) to the type of array for which the loops are compiled."""
-    array = np.ascontiguousarray(numbers(name, values))
+    plain = type(values) is np.ndarray and values.dtype.char == "d"  # the common case, fast
+    array = np.ascontiguousarray(values if plain else numbers(name, values))
     if array.shape[-1] != length:
         raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")
     return array if array.flags.writeable else array.copy()
@@ -186,7 +187,8 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
 
 def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
     """Repeat vectors up to the shape of an array (..., 3)."""
-    array = numbers("vectors", values)
+    plain = type(values) is np.ndarray and values.dtype.char == "d"  # the common case, fast
+    array: Any = values if plain else numbers("vectors", values)
     if array.shape != like.shape:  # broadcast_to() is slow, and its result has to be copied
         try:
             array = np.broadcast_to(array, like.shape)
