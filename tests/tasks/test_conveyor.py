@@ -35,6 +35,9 @@ def test_the_expert_picks_at_any_speed_of_the_belt(speed):
     *_, (_, _, info) = expert_episode(env, 0, STEPS, options)
     assert env.unwrapped.state.belt_speed == speed
     assert info["is_success"]
+    # A block on a belt that stands is drawn at the edge of the reach.
+    *_, (_, _, info) = expert_episode(env, 0, STEPS, {"belt_speed": speed})
+    assert info["is_success"]
 
 
 def test_tempting_ways_are_only_just_safe():
