@@ -30,6 +30,8 @@ def follow(simulation, commands):
             for name in ("width", "height", "mass", "friction")
             for value in (-0.05, 0.0, np.nan, np.inf, "heavy", None, [0.05])
         ),
+        *(("mass", value) for value in (1e-300, 1e300)),  # not with every engine
+        ("friction", 1e300),
         *(("name", value) for value in ("", 3, None)),
         *(("colour", value) for value in ("red", (1, 0, 0), (0, 0, 0, 1.1), (-0.1, 0, 0, 1))),
     ],

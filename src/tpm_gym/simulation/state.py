@@ -12,6 +12,8 @@ from tpm_gym.errors import ConfigurationError, InputError
 CONTROL_PERIOD = 1 / 25
 """Control period of tasks that set no other: time between two commands, s."""
 
+_LIGHTEST, _HEAVIEST, _ROUGHEST = 1e-6, 1e6, 1e6  # of blocks, kg, and their largest friction
+
 
 @dataclass(frozen=True)
 class Block:
@@ -24,8 +26,8 @@ class Block:
         name: Key in ``reset(options=...)``; unique in its scene.
         width: Edge length of the base, m.
         height: Height, m.
-        mass: Mass, kg.
-        friction: Coulomb coefficient against the table.
+        mass: Mass, 1e-6 to 1e6 kg.
+        friction: Coulomb coefficient against the table, at most 1e6.
         colour: Red, green, blue and opacity, each from 0 to 1.
 
     Raises:
@@ -45,6 +47,12 @@ class Block:
             raise ConfigurationError("name", self.name, "a name")
         for name in ("width", "height", "mass", "friction"):
             _require_positive(name, getattr(self, name))
+        # Engines compute no contacts of far lighter, heavier or rougher blocks.
+        if not _LIGHTEST <= self.mass <= _HEAVIEST:
+            valid = f"a number from {_LIGHTEST:g} to {_HEAVIEST:g} kg"
+            raise ConfigurationError("mass", self.mass, valid)
+        if self.friction > _ROUGHEST:
+            raise ConfigurationError("friction", self.friction, f"at most {_ROUGHEST:g}")
         colour = finite("colour", self.colour, (4,), ConfigurationError)
         if not ((colour >= 0) & (colour <= 1)).all():
             raise ConfigurationError("colour", self.colour, "four numbers from 0 to 1")
