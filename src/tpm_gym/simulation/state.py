@@ -53,9 +53,7 @@ class Block:
             raise ConfigurationError("mass", self.mass, valid)
         if self.friction > _ROUGHEST:
             raise ConfigurationError("friction", self.friction, f"at most {_ROUGHEST:g}")
-        colour = finite("colour", self.colour, (4,), ConfigurationError)
-        if not ((colour >= 0) & (colour <= 1)).all():
-            raise ConfigurationError("colour", self.colour, "four numbers from 0 to 1")
+        _require_colour(self.colour)
 
     @property
     def half(self) -> Vector:
@@ -119,11 +117,22 @@ class Patch:
         low: Lowest x and y, m, world.
         high: Highest x and y, m, world.
         colour: Red, green, blue and opacity, each from 0 to 1.
+
+    Raises:
+        ConfigurationError: If a value is out of range.
     """
 
     low: tuple[float, float]
     high: tuple[float, float]
     colour: tuple[float, float, float, float]
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        low = finite("low", self.low, (2,), ConfigurationError)
+        high = finite("high", self.high, (2,), ConfigurationError)
+        if not (low < high).all():
+            raise ConfigurationError("high", self.high, f"above low, {self.low}")
+        _require_colour(self.colour)
 
 
 @dataclass(frozen=True)
@@ -156,6 +165,11 @@ class Scene:
         ):
             valid = "a tuple of blocks, each with a name of its own, other than goal, belt_speed"
             raise ConfigurationError("objects", self.objects, valid)
+        if self.belt is not None and not isinstance(self.belt, Belt):
+            raise ConfigurationError("belt", self.belt, "None or a Belt")
+        patches = isinstance(self.patches, tuple)
+        if not patches or not all(isinstance(patch, Patch) for patch in self.patches):
+            raise ConfigurationError("patches", self.patches, "a tuple of Patch")
         if not is_whole(self.markers, 0):
             raise ConfigurationError("markers", self.markers, "a whole number, 0 or more")
         _require_positive("marker_radius", self.marker_radius)
@@ -220,6 +234,12 @@ class State:
     def passed_singularity(self) -> BoolArray:
         """Whether each robot left its assembly or working mode in this episode, (n,)."""
         return self.assembly_mode_changed | self.working_mode_changed
+
+
+def _require_colour(colour: Any) -> None:
+    values = finite("colour", colour, (4,), ConfigurationError)
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ConfigurationError("colour", colour, "four numbers from 0 to 1")
 
 
 def _require_positive(name: str, value: float) -> None:
