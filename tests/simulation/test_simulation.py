@@ -11,7 +11,7 @@ from states import apart
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Block, Scene, Servo
+from tpm_gym.simulation import Block, Plant, Scene, Servo
 from tpm_gym.simulation.engine import spline_weights
 from tpm_gym.simulation.state import Patch
 
@@ -140,6 +140,8 @@ def test_what_cannot_be_followed_raises_and_moves_nothing(simulation):
     ):
         with pytest.raises(error):
             call(value)
+    with pytest.raises(InputError, match=r"\['cube'\]"):  # the scene has an 'object'
+        simulation.reset(THETA, {"cube": (0.0, -0.02, 0.015)}, Plant(friction=0.5))
     after = simulation.read()
     assert np.array_equal(before.theta, after.theta)
     assert np.array_equal(before.command, after.command)
