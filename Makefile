@@ -40,7 +40,7 @@ demo-film:
 	$(VENV)/bin/tpm-gym evaluate --policy runs/demo/pick_and_place/best.json --episodes 2 --seed 2000006 \
 		--video runs/demo/pick_and_place.mp4 --picture runs/demo/pick_and_place.png
 
-test: $(INSTALLED) ## the gate, here and in CI: lint, types, fast tests
+test: $(INSTALLED) ## all checks, here and in CI: lint, types, fast tests
 	$(MAKE) -j2 lint compiled
 	$(MAKE) test-fast
 
@@ -80,7 +80,7 @@ figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/
 	$(RUN) docs/draw_figures.py
 
 compare: $(INSTALLED) ## the TPM and the Delta, measured; see docs/compare.md
-	$(RUN) benchmarks/compare.py
+	$(RUN) benchmarks/compare.py --write
 
 gradients: $(INSTALLED) ## lengths and ways improved by gradients, again; see docs/gradients.md; minutes
 	$(RUN) docs/draw_gradients.py
@@ -94,36 +94,36 @@ bench-learning: $(INSTALLED) ## train and test all ids with five seeds, as far a
 	$(MAKE) results
 
 bench-cloning: $(INSTALLED) ## behaviour cloning from 10, 50 and 400 episodes; see docs/datasets.md; an hour
-	$(RUN) benchmarks/bench_cloning.py
+	$(RUN) benchmarks/bench_cloning.py --write
 
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
 	$(RUN) benchmarks/bench_kinematics.py
 
 bench-fidelity: $(INSTALLED) ## loop gaps, FK error and tilt against cost; see docs/loops.md
-	$(RUN) benchmarks/bench_fidelity.py
+	$(RUN) benchmarks/bench_fidelity.py --write
 
 bench-evaluate: $(INSTALLED) ## what tpm-gym evaluate costs beyond the stepping
 	$(RUN) benchmarks/bench_evaluate.py --json runs/evaluate.json
 
 bench-conveyor: $(INSTALLED) ## picks a minute from a belt, beside supply and bound; see docs/conveyor.md
-	$(RUN) benchmarks/bench_conveyor.py
+	$(RUN) benchmarks/bench_conveyor.py --write
 
 bench-engines: $(INSTALLED) ## both engines and theory on the same commands; policies over engines and drives
-	$(RUN) benchmarks/bench_engines.py --jobs 2
+	$(RUN) benchmarks/bench_engines.py --jobs 2 --write
 
 bench-engine: $(INSTALLED) ## the analytic engine: speed and agreement, beside PyBullet and panda-gym
 	$(PIP) -e ".[bench]"
-	$(RUN) benchmarks/bench_engine.py
+	$(RUN) benchmarks/bench_engine.py --write
 	$(RUN) benchmarks/readme_numbers.py
 
 bench-long: $(INSTALLED) ## loop gaps and FK error over a million time steps a motion; see docs/fidelity.md; minutes
-	$(RUN) benchmarks/bench_fidelity.py --long 1000000
+	$(RUN) benchmarks/bench_fidelity.py --long 1000000 --write
 
 bench-limits: $(INSTALLED) ## success in each engine at two time steps; see docs/analytic-engine.md; minutes
-	$(RUN) benchmarks/engine_limits.py --jobs 2
+	$(RUN) benchmarks/engine_limits.py --jobs 2 --write
 
 bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs/transfer), tested in all
-	$(RUN) benchmarks/bench_transfer.py --jobs 2
+	$(RUN) benchmarks/bench_transfer.py --jobs 2 --write
 
 bench-first: $(INSTALLED) ## from the start of Python to the first step, with and without compiled code on disk
 	$(RUN) benchmarks/bench_first.py
@@ -132,16 +132,16 @@ bench-shield: $(INSTALLED) ## the shield: violations, margins, cost, policies; h
 	for seed in 0 1 2 3 4; do for shield in "" --shield; do \
 		$(VENV)/bin/tpm-gym train --algo ppo --engine analytic --env TPMReachJointsDense-v0 --goals tempting \
 		--test-episodes 0 --seed $$seed $$shield --run runs/shield/s$$seed$$shield --overwrite; done; done
-	$(RUN) benchmarks/bench_shield.py
+	$(RUN) benchmarks/bench_shield.py --write
 
 bench-tasks: $(INSTALLED) ## success of the expert in each task, engine and condition; see docs/tasks.md; an hour
-	$(RUN) benchmarks/bench_tasks.py
+	$(RUN) benchmarks/bench_tasks.py --write
 
 bench-crossing: $(INSTALLED) ## passages of y = 0 in each engine; see docs/crossing.md; minutes
-	$(RUN) benchmarks/bench_crossing.py
+	$(RUN) benchmarks/bench_crossing.py --write
 
 bench-cycle: $(INSTALLED) ## cycle times and torques of 25-305-25 mm in each engine; see docs/cycle.md; minutes
-	$(RUN) benchmarks/bench_cycle.py
+	$(RUN) benchmarks/bench_cycle.py --write
 
 bench-speed: $(INSTALLED) ## steps per second beside panda-gym and Gymnasium-Robotics
 	$(PIP) -e ".[bench]"

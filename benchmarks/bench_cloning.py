@@ -1,4 +1,4 @@
-"""Behaviour cloning from datasets of 10, 50 and 400 episodes, over five seeds.
+"""Behaviour cloning from datasets of 10, 50 and 400 episodes, over several seeds.
 
     python benchmarks/bench_cloning.py
 
@@ -6,8 +6,8 @@
 own, by the same number of updates of :func:`tpm_gym.learning.cloning.clone`. Speeds and the
 command are hidden from the networks: the last action can be read from them, and a network that sees
 them repeats it. Policies are tested in the analytic engine, in the episodes that
-``tpm-gym evaluate`` takes. Results go to docs/records/cloning.json, and from there to
-docs/datasets.md.
+``tpm-gym evaluate`` takes. With ``--write``, results go to docs/records/cloning.json, and from
+there to docs/datasets.md.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import torch
 from gymnasium import spaces
 from minari import MinariDataset
 from numpy.typing import NDArray
-from shared import ROOT, describe, fill, read_record, table
+from shared import ROOT, describe, fill, make_parser, publish, read_record, table
 from stable_baselines3 import PPO
 from studies.reliability import interquartile_mean
 
@@ -145,26 +145,29 @@ def _place(row: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def main() -> None:
-    """Measure, or write the page from the record."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    """Measure and publish, or fill the page from the record."""
+    parser = make_parser(__doc__.partition("\n")[0])
     parser.add_argument("--updates", type=int, default=UPDATES, help="updates of each training")
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--envs", nargs="+", choices=IDS, default=IDS, help="keep rows of others")
-    parser.add_argument("--hide", nargs="*", default=HIDDEN, help="hidden entries")
+    parser.add_argument("--hide", nargs="*", default=HIDDEN, help="hidden entries; no name: none")
     parser.add_argument("--only-page", action="store_true", help="write the page, measure nothing")
     args = parser.parse_args()
-    if not args.only_page:
-        torch.set_num_threads(1)
-        about = describe(sys.argv)
-        with tempfile.TemporaryDirectory() as folder:
-            old = read_record(RECORD) or {"rows": []}
-            rows = {_place(row): row for row in old["rows"] if row["env"] not in args.envs}
-            for row in measure(args, Path(folder)):
-                rows[_place(row)] = row
-                counts = {"updates": args.updates, "tested": EPISODES, "hidden": list(args.hide)}
-                sorted_rows = [rows[place] for place in sorted(rows)]
-                write_json(RECORD, {**about, **counts, "rows": sorted_rows})
-    fill(PAGE, "cloning", lines(read_record(RECORD)))
+    if args.only_page:
+        fill(PAGE, "cloning", lines(read_record(RECORD)))
+        return
+    torch.set_num_threads(1)
+    counts = {"updates": args.updates, "tested": EPISODES, "hidden": list(args.hide)}
+    record = {**describe(sys.argv), **counts, "rows": []}
+    with tempfile.TemporaryDirectory() as folder:
+        old = (args.write and read_record(RECORD)) or {"rows": []}
+        rows = {_place(row): row for row in old["rows"] if row["env"] not in args.envs}
+        for row in measure(args, Path(folder)):
+            rows[_place(row)] = row
+            record["rows"] = [rows[place] for place in sorted(rows)]
+            if args.write:  # an interrupted run keeps its results
+                write_json(RECORD, record)
+    publish(record, RECORD, PAGE, "cloning", lines, write=args.write)
 
 
 if __name__ == "__main__":

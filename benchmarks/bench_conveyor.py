@@ -13,13 +13,12 @@ A learned policy knows one block, and places on the table. It plays a stream of 
 shown the first one that is not in its place. It never learned to let go, as its task does not ask
 for that: at the place, this script lets go and lifts the cup.
 
-Results go to docs/records/conveyor.json, and from there to docs/conveyor.md. A run without
-``--policies`` keeps the rows of policies, and those of the expert in their streams.
+With ``--write``, results go to docs/records/conveyor.json, and from there to docs/conveyor.md. A
+run without ``--policies`` keeps the rows of policies, and those of the expert in their streams.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
@@ -28,7 +27,7 @@ from typing import Any, ClassVar, Final, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from shared import ROOT, describe, fill, made_by, provenance, read_record, table
+from shared import ROOT, describe, made_by, make_parser, publish, read_record, table
 
 from tpm_gym import TPMVectorEnv, load_policy
 from tpm_gym.arrays import FloatArray
@@ -263,8 +262,8 @@ def measure(streams: int, fewer: int, policies: Sequence[Path]) -> Iterator[dict
 
 
 def main() -> None:
-    """Parse the options, measure, write the record and fill the page."""
-    parser = argparse.ArgumentParser(description="Picks a minute from a belt.")
+    """Parse the options, measure and publish the record."""
+    parser = make_parser("Picks a minute from a belt.")
     parser.add_argument("--streams", type=int, default=50, help="in the analytic engine")
     parser.add_argument("--fewer", type=int, default=10, help="in PyBullet and MuJoCo")
     parser.add_argument(
@@ -276,8 +275,7 @@ def main() -> None:
         cells.append(cell)
         print(cell, file=sys.stderr)
     record = merged(read_record(RECORD), describe(sys.argv), cells)
-    provenance.write_json(RECORD, record)
-    fill(PAGE, "conveyor", lines(read_record(RECORD)))
+    publish(record, RECORD, PAGE, "conveyor", lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -2,13 +2,11 @@
 
     make bench-crossing
 
-Results go to docs/records/crossing.json, and from there to docs/crossing.md.
+With ``--write``, results go to docs/records/crossing.json, and from there to docs/crossing.md.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -16,7 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from shared import ROOT, describe, fill, processor_line, table
+from shared import ROOT, describe, make_parser, processor_line, publish, table
 
 from tpm_gym.tasks import Expert
 
@@ -112,8 +110,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure, and write the record and the page."""
-    parser = argparse.ArgumentParser(description="Measure passages of y = 0.")
+    """Measure, and publish the record."""
+    parser = make_parser("Measure passages of y = 0.")
     parser.add_argument("--episodes", type=int, default=1000, help="of the expert in each engine")
     parser.add_argument("--fewer", type=int, default=100, help="episodes of the other rows")
     options = parser.parse_args()
@@ -128,8 +126,7 @@ def main() -> None:
             for name, own in DISTURBED.items()
         },
     }
-    RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    fill(PAGE, "crossing", lines(record))
+    publish(record, RECORD, PAGE, "crossing", lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -5,15 +5,13 @@
 
 A cycle is the way there and the way back, with servo drives, at the depth y in the middle of the
 goals. A way ends when P is within 2 mm of the end for good, by the truth of the simulation, 4 ms
-apart. The RMS of the torques is over both ways without a pause between them. Results go to
-docs/records/cycle.json, and from there to docs/cycle.md. A run with ``--policy`` measures the
-policy alone; a run without it keeps the policy's rows.
+apart. The RMS of the torques is over both ways without a pause between them. With ``--write``,
+results go to docs/records/cycle.json, and from there to docs/cycle.md. A run with ``--policy``
+measures the policy alone; a run without it keeps the policy's rows.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
@@ -22,7 +20,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from shared import ROOT, describe, fill, processor_line, read_record, table
+from shared import ROOT, describe, make_parser, processor_line, publish, read_record, table
 
 from tpm_gym import PAPER_TPM, load_policy
 from tpm_gym.arrays import FloatArray
@@ -169,8 +167,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Measure, and write the record and the page."""
-    parser = argparse.ArgumentParser(description="Measure the expert of Cycle.")
+    """Measure, and publish the record."""
+    parser = make_parser("Measure the expert of Cycle.")
     parser.add_argument("--episodes", type=int, help="episodes of each engine (default: 1,000)")
     parser.add_argument("--policy", help="an exported policy to measure too, at 0.1 kg")
     options = parser.parse_args(argv)
@@ -189,8 +187,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     for row, own in zip(record.get("policy", []), record["cycles"], strict=False):
         if row["seconds"] is not None:
             row["slower"] = round(row["seconds"] / own["seconds"] - 1, 4)
-    RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    fill(PAGE, "cycle", lines(record))
+    publish(record, RECORD, PAGE, "cycle", lines, write=options.write)
 
 
 def _expert(env: Any) -> Act:

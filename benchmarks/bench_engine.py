@@ -23,7 +23,6 @@ docs/images/analytic.png.
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 import time
@@ -246,8 +245,8 @@ def evaluation() -> float:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="Speed and accuracy of the analytic engine.")
-    parser.add_argument("--quick", action="store_true", help="a minute or two; writes no files")
+    parser = shared.make_parser("Speed and accuracy of the analytic engine.")
+    parser.add_argument("--quick", action="store_true", help="a minute or two")
     parser.add_argument("--episodes", type=int, default=1000, help="of each row of success")
     parser.add_argument(
         "--part", choices=("speed", "threads", "torques", "success"), help="only this one"
@@ -273,7 +272,7 @@ def main() -> None:
         name: {"machine": shared.describe(sys.argv), "rows": parts[name]()} for name in chosen
     }
     print("\n".join(analytic_report.lines(record)))
-    if not quick:
+    if options.write:
         analytic_report.write(record)
         analytic_report.publish()
 

@@ -14,13 +14,12 @@ turns.
 Matrix: success of the expert and of the published policies in each engine with each drive, with and
 without noise on their actions, which makes them drop, throw and shove.
 
-Results go to docs/records/engines.json, and from there to docs/engines.md and
+With ``--write``, results go to docs/records/engines.json, and from there to docs/engines.md and
 docs/images/engines.png.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -128,16 +127,19 @@ def _place(cell: dict[str, Any]) -> tuple[Any, ...]:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="Compare engines and theory.")
-    parser.add_argument("--quick", action="store_true", help="some minutes; writes no files")
+    parser = shared.make_parser("Compare engines and theory.")
+    parser.add_argument("--quick", action="store_true", help="some minutes")
     parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
     parts = ("motions", "cost", "expert", *IDS)
     parser.add_argument("--renew", nargs="+", choices=parts, help="measure only these again")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the records")
     options = parser.parse_args()
+    if options.redraw:
+        publish()
+        return
     if options.renew:
-        provenance.write_json(RECORD, renewed(read_record(RECORD), options.renew, options.jobs))
-    elif not options.redraw:
+        record = renewed(read_record(RECORD), options.renew, options.jobs)
+    else:
         quick = options.quick
         record = {
             "machine": shared.describe(sys.argv),
@@ -146,11 +148,10 @@ def main() -> None:
             "cost": costs(ENGINES, 4 if quick else ROUNDS),
             "matrix": matrix(cells(ENGINES, 10 if quick else EPISODES), options.jobs),
         }
-        print("\n".join(lines(record)))
-        if quick:
-            return
+    print("\n".join(lines(record)))
+    if options.write:
         provenance.write_json(RECORD, record)
-    publish()
+        publish()
 
 
 if __name__ == "__main__":

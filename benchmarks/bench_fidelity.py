@@ -10,13 +10,13 @@ random Cartesian actions. Expert: commands of the scripted expert in TPMPickAndP
 speed with sudden changes of direction, and sweeps of 1.5 Hz over the whole region, more than twice
 as fast as the environments allow.
 
-Results go to stdout, runs/fidelity.json, docs/images/fidelity.png and docs/loops-sweep.md.
-``--long N`` runs the default alone in the real environment, for N time steps of each motion.
+With ``--write``, results go to runs/fidelity.json, docs/images/fidelity.png and
+docs/loops-sweep.md. ``--long N`` runs the default alone in the real environment, for N time steps
+of each motion.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from functools import partial
 
@@ -39,8 +39,8 @@ def motions(quick: bool) -> list[Motion]:
     ]
 
 
-def run_sweep(quick: bool, keep: bool) -> None:
-    """Measure and print; also write the files unless ``keep`` says to keep the old ones."""
+def run_sweep(quick: bool, write: bool) -> None:
+    """Measure and print; with ``write``, also replace the files."""
     description = shared.describe(sys.argv)
     followed, results = motions(quick), []
     for config in sweep():
@@ -51,10 +51,9 @@ def run_sweep(quick: bool, keep: bool) -> None:
     line = shared.processor_line(description)
     print(f"{line}\n")
     report.print_table(results)
-    if keep:
-        return
-    report.write_json(results, description)
-    publish()
+    if write:
+        report.write_json(results, description)
+        publish()
 
 
 def publish() -> None:
@@ -67,17 +66,17 @@ def publish() -> None:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="Fidelity of the closed loops against cost.")
-    parser.add_argument("--quick", action="store_true", help="a minute; writes no files")
+    parser = shared.make_parser("Fidelity of the closed loops against cost.")
+    parser.add_argument("--quick", action="store_true", help="a minute")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the last run")
     parser.add_argument("--long", type=int, metavar="N", help="N time steps a motion, default only")
     options = parser.parse_args()
     if options.long is not None:
-        fidelity_long.run(options.long, partial(shared.describe, sys.argv))
+        fidelity_long.run(options.long, partial(shared.describe, sys.argv), options.write)
     elif options.redraw:
         publish()
     else:
-        run_sweep(options.quick, keep=options.quick)
+        run_sweep(options.quick, options.write)
 
 
 if __name__ == "__main__":

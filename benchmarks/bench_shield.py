@@ -14,7 +14,7 @@ Parts:
 - policies: success of the published policies with and without it.
 - training: tests of the runs in ``--runs``, which were trained with ``--goals tempting``.
 
-Results go to docs/records/shield.json, and from there to docs/shield.md.
+With ``--write``, results go to docs/records/shield.json, and from there to docs/shield.md.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
-from shared import ROOT, describe, fill, made_by, provenance, read_record, table
+from shared import ROOT, describe, made_by, make_parser, provenance, publish, read_record, table
 
 from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import load_policy
@@ -42,7 +42,6 @@ from tpm_gym.mechanism.machine import find_machine
 from tpm_gym.simulation.engine import spline_weights
 
 RECORD, PAGE = ROOT / "docs" / "records" / "shield.json", ROOT / "docs" / "shield.md"
-PARTS = ("soak", "engines", "margins", "cost", "policies", "training")
 IDS = ("TPMReach-v0", "TPMReachJoints-v0")
 MACHINES = ("paper", "wide")
 PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReach-v0")
@@ -169,8 +168,8 @@ def _true(envs: Any) -> NDArray[Any]:
     return np.concatenate(found)
 
 
-def soak_all(content: dict[str, Any], options: argparse.Namespace, engine: str) -> None:
-    """Soak ids and machines in turn, and write the sums after each."""
+def soak_all(content: dict[str, Any], options: argparse.Namespace, engine: str) -> Iterator[None]:
+    """Soak ids and machines in turn; yield after each."""
     name, count = ("soak", 2000) if engine == "analytic" else ("engines", 20)
     total = options.steps if engine == "analytic" else options.engine_steps
     rows = content[name] = {}
@@ -183,10 +182,10 @@ def soak_all(content: dict[str, Any], options: argparse.Namespace, engine: str) 
         for entry, value in found.items():
             old[entry] = min(old[entry], value) if entry in ("path", "true") else old[entry] + value
         turn += 1
-        write(content)
+        yield
 
 
-def margins(content: dict[str, Any], options: argparse.Namespace) -> None:
+def margins(content: dict[str, Any], options: argparse.Namespace) -> Iterator[None]:
     """Soak with drives and plants that do not follow exactly, for each margin."""
     rows = content["margins"] = {}
     for (name, others), machine in product(OTHERS.items(), MACHINES):
@@ -196,10 +195,10 @@ def margins(content: dict[str, Any], options: argparse.Namespace) -> None:
             own = {"engine": "analytic", "machine": machine, "shield": least, **others}
             found = [soak(env_id, 500, options.other_steps // 2, 0, **own) for env_id in IDS]
             lows[f"{margin:.0%}"] = min(entry["true"] for entry in found)
-        write(content)
+        yield
 
 
-def cost(content: dict[str, Any], options: argparse.Namespace) -> None:
+def cost(content: dict[str, Any], options: argparse.Namespace) -> Iterator[None]:
     """Time steps with and without the shield, and the shield alone; the least of ten rounds."""
     rows = content["cost"] = {}
     for env_id, engine, count, steps in (
@@ -226,10 +225,10 @@ def cost(content: dict[str, Any], options: argparse.Namespace) -> None:
         rows[f"{env_id}, {engine}, {count}"] = [1e9 * seconds for seconds in least]
         for envs in pair:
             envs.close()
-        write(content)
+        yield
 
 
-def policies(content: dict[str, Any], options: argparse.Namespace) -> None:
+def policies(content: dict[str, Any], options: argparse.Namespace) -> Iterator[None]:
     """Test published policies with and without the shield, in PyBullet."""
     rows = content["policies"] = {}
     for policy in PUBLISHED:
@@ -237,10 +236,10 @@ def policies(content: dict[str, Any], options: argparse.Namespace) -> None:
             rows[f"{policy}, {'shield' if shield else 'without'}"] = tested(
                 policy, policy, options.episodes, "pybullet", 1, shield=shield
             )
-            write(content)
+            yield
 
 
-def training(content: dict[str, Any], options: argparse.Namespace) -> None:
+def training(content: dict[str, Any], options: argparse.Namespace) -> Iterator[None]:
     """Test the policies of training runs on tempting goals, as they were trained."""
     rows = content["training"] = {}
     for file in sorted(options.runs.glob("*/config.json")):
@@ -258,7 +257,7 @@ def training(content: dict[str, Any], options: argparse.Namespace) -> None:
                 goals="tempting",
             )
             rows.setdefault(key, {}).setdefault(engine, []).append(found)
-            write(content)
+            yield
 
 
 def tested(
@@ -274,13 +273,17 @@ def tested(
     }
 
 
+PARTS: Final[dict[str, Callable[[dict[str, Any], argparse.Namespace], Iterator[None]]]] = {
+    "soak": partial(soak_all, engine="analytic"),
+    "engines": partial(soak_all, engine="pybullet"),
+    "margins": margins,
+    "cost": cost,
+    "policies": policies,
+    "training": training,
+}
+"""Measurements by name; each adds its rows to a record, and yields after each row."""
+
 # -- record and page ------------------------------------------------------------------------------
-
-
-def write(content: dict[str, Any]) -> None:
-    """Write record and page, so that an interrupted run keeps its results."""
-    provenance.write_json(RECORD, content)
-    fill(PAGE, "shield", lines(content))
 
 
 def lines(content: dict[str, Any]) -> Iterator[str]:
@@ -359,9 +362,9 @@ def _share(row: dict[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run parts and write record and page."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
-    parser.add_argument("--part", nargs="+", choices=PARTS, default=PARTS)
+    """Run parts and publish the record."""
+    parser = make_parser((__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--part", nargs="+", choices=PARTS, default=[*PARTS])
     parser.add_argument("--steps", type=int, default=100_000_000, help="in the analytic engine")
     parser.add_argument("--engine-steps", type=int, default=100_000, help="in PyBullet")
     parser.add_argument("--other-steps", type=int, default=100_000, help="of each margin")
@@ -369,13 +372,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "shield")
     options = parser.parse_args(arguments)
     words = sys.argv if arguments is None else ["benchmarks/bench_shield.py", *arguments]
-    content = read_record(RECORD)
+    content = read_record(RECORD) if options.write else {}
     for part in options.part:
         content[f"{part} made by"] = describe(words)
-        if part in ("soak", "engines"):
-            soak_all(content, options, "analytic" if part == "soak" else "pybullet")
-        else:
-            globals()[part](content, options)
+        for _ in PARTS[part](content, options):
+            if options.write:  # an interrupted run keeps its results
+                provenance.write_json(RECORD, content)
+    publish(content, RECORD, PAGE, "shield", lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -5,13 +5,12 @@
 
 The expert plays each task on the paper's machine in each engine, on the wide machine, and with
 goals that tempt towards the singularity. Policies are tested under the conditions in which they
-were trained. A cell that is measured again replaces the old one in docs/records/tasks.json, from
-which docs/tasks.md is filled.
+were trained. With ``--write``, a cell that is measured again replaces the old one in
+docs/records/tasks.json, from which docs/tasks.md is filled.
 """
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import json
 import sys
@@ -20,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rich.console import Console
-from shared import ROOT, describe, fill, processor_line, read_record, table
+from shared import ROOT, describe, make_parser, processor_line, publish, read_record, table
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import provenance
@@ -108,7 +107,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     groups = [(name, "expert", *_conditions(other)) for name in IDS for other in OTHERS]
     groups += dict.fromkeys(tuple(cell[name] for name in _KEY[:-1]) for cell in trained)
     yield from table(
-        ["task", "controller", "machine", "goals", "analytic", "pybullet"],
+        ["task", "played by", "machine", "goals", "analytic", "pybullet"],
         [
             [group[0], _controller(group[1]), *group[2:]]
             + [shown(*group, engine) for engine in ENGINES[:2]]
@@ -135,14 +134,14 @@ def _length(kind: type) -> int:
 
 
 def main() -> None:
-    """Measure, and write the record and the page after each cell."""
-    parser = argparse.ArgumentParser(description="Success in each task.")
+    """Measure, and publish the record."""
+    parser = make_parser("Success in each task.")
     parser.add_argument("--envs", nargs="+", choices=IDS, default=[*IDS], help="default: all")
     parser.add_argument("--policies", nargs="+", type=Path, help="run folders, instead of experts")
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--fewer", type=int, default=200, help="in PyBullet, other conditions")
     options = parser.parse_args()
-    record = read_record(RECORD) or {"cells": []}
+    record = (options.write and read_record(RECORD)) or {"cells": []}
     record["conditions"] = describe(sys.argv)
     counts = options.episodes, options.fewer
     if options.policies:
@@ -153,9 +152,10 @@ def main() -> None:
         key = [cell[name] for name in _KEY]
         left = [old for old in record["cells"] if [old[name] for name in _KEY] != key]
         record["cells"] = [*left, cell]
-        provenance.write_json(RECORD, record)
+        if options.write:  # an interrupted run keeps its results
+            provenance.write_json(RECORD, record)
         print(cell, file=sys.stderr)
-    fill(PAGE, "tasks", lines(record))
+    publish(record, RECORD, PAGE, "tasks", lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -8,12 +8,11 @@ The best policy of each run in ``--runs`` and the published policies are tested 
 ideal and servo drives. Include runs of few steps (``--steps``), whose policies drop the block, and
 of ``shoving.py``, because errors of contact would show in both.
 
-Results go to docs/records/transfer.json, and from there to docs/transfer.md.
+With ``--write``, results go to docs/records/transfer.json, and from there to docs/transfer.md.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Iterator, Sequence
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from engine_matrix import DRIVES
-from shared import ROOT, describe, fill, provenance, table
+from shared import ROOT, describe, make_parser, publish, table
 
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
@@ -121,12 +120,11 @@ def _rate(cell: dict[str, Any]) -> float:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = argparse.ArgumentParser(description="Test policies in all engines.")
+    parser = make_parser("Test policies in all engines.")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "transfer")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--dry", action="store_true", help="writes no files")
     options = parser.parse_args()
     todo = list(cells(options.runs, options.episodes, options.drives))
     found = []
@@ -139,10 +137,7 @@ def main() -> None:
         "episodes": options.episodes,
         "cells": found,
     }
-    print("\n".join(lines(record)))
-    if not options.dry:
-        provenance.write_json(RECORD, record)
-        fill(PAGE, "transfer", lines(record))
+    publish(record, RECORD, PAGE, "transfer", lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
     make compare
 
-Results go to docs/records/compare.json, and from there to the table of docs/compare.md; the figure
-is docs/images/compare.png. Everything is computed by the same functions of a machine, in its
-assembly and working mode, and only where every motor is between its stops.
+With ``--write``, results go to docs/records/compare.json, and from there to the table of
+docs/compare.md; the figure is docs/images/compare.png. Everything is computed by the same functions
+of a machine, in its assembly and working mode, and only where every motor is between its stops.
 
 The rows of learning are read from the trainings of ``python -m benchmarks.studies run --plan
 machines --engine analytic`` in the folder of ``--runs``, and for the paper's machine from
@@ -14,7 +14,6 @@ else.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -27,7 +26,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from shared import ROOT, describe, fill, provenance, read_record, table
+from shared import ROOT, describe, make_parser, publish, read_record, table
 from studies.page import settled
 
 from tpm_gym.analysis import delta as delta_analysis
@@ -405,8 +404,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Measure all machines, write the record, and fill the page."""
-    parser = argparse.ArgumentParser(description="The TPM and the Delta, measured.")
+    """Measure all machines and publish the record."""
+    parser = make_parser("The TPM and the Delta, measured.")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "study")
     parser.add_argument("--learning-only", action="store_true", help="keep what is measured")
     options = parser.parse_args()
@@ -418,10 +417,10 @@ def main() -> None:
     if not options.learning_only:
         record["measured"] = {name: column(machine) for name, machine in MACHINES.items()}
         record["machine"] = describe(sys.argv)
+    publish(record, RECORD, DOCS / "compare.md", "compare", lines, write=options.write)
+    if options.write and not options.learning_only:
         with style.style():
             style.save(figure(), DOCS / "images" / "compare.png")
-    provenance.write_json(RECORD, record)
-    fill(DOCS / "compare.md", "compare", lines(read_record(RECORD)))
 
 
 if __name__ == "__main__":

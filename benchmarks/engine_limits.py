@@ -4,8 +4,8 @@
 
 Each engine acts on its own observations. Noise makes the policy drop, throw and shove, so that
 success depends on contact. Engines agree if their numbers do, and a time step is short enough if a
-shorter one gives the same numbers. Results of the published policy go to docs/records/limits.json,
-and from there to docs/analytic-engine.md; those of a file are printed.
+shorter one gives the same numbers. With ``--write``, results go to docs/records/limits.json, and
+from there to docs/analytic-engine.md.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from contextlib import closing
 from itertools import product
 from typing import Any, NamedTuple
 
-from shared import ROOT, describe, fill, provenance, read_record, table
+from shared import ROOT, describe, make_parser, publish, table
 
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
@@ -64,11 +64,6 @@ def run(cell: Cell) -> dict[str, Any]:
     }
 
 
-def publish() -> None:
-    """Fill the page from the record."""
-    fill(PAGE, "limits", lines(read_record(RECORD)))
-
-
 def lines(record: dict[str, Any]) -> Iterator[str]:
     """Yield the table in Markdown: a row for each noise."""
     if not record:
@@ -97,7 +92,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
 
 def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
-    parser = argparse.ArgumentParser(description="Success of a policy in each engine.")
+    parser = make_parser("Success of a policy in each engine.")
     parser.add_argument("--policy", default=ENV_ID, help="id of a published policy, or a file")
     parser.add_argument("--milliseconds", type=float, nargs="+", default=MILLISECONDS)
     parser.add_argument("--noises", type=float, nargs="+", default=NOISES)
@@ -107,7 +102,7 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def main() -> None:
-    """Parse the options, measure, write the record and fill the page."""
+    """Parse the options, measure and publish the record."""
     options = parse()
     todo = [
         Cell(noise, engine, step, options.episodes, options.policy)
@@ -119,10 +114,7 @@ def main() -> None:
             print(cell, file=sys.stderr)
             found.append(cell)
     record = {"machine": describe(sys.argv), "episodes": options.episodes, "cells": found}
-    print("\n".join(lines(record)))
-    if options.policy == ENV_ID:
-        provenance.write_json(RECORD, record)
-        publish()
+    publish(record, RECORD, PAGE, "limits", lines, write=options.write)
 
 
 if __name__ == "__main__":

@@ -162,7 +162,7 @@ def _agreement(axes: Axes, record: dict[str, Any]) -> None:
         )
     axes.set_yticks(range(len(names)), names)
     axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.set(xscale="log", xlabel="relative RMS of the torques apart (%)")
+    axes.set(xscale="log", xlabel="RMS difference of torques (%)")
     axes.set_title("Torques", loc="left")
     axes.grid(axis="x", color="0.92", linewidth=0.6)
 

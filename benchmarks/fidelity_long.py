@@ -1,6 +1,6 @@
 """Errors of the default settings in the real environment, at each of many time steps.
 
-Results go to docs/records/fidelity.json, and from there to docs/fidelity.md.
+With ``--write``, results go to docs/records/fidelity.json, and from there to docs/fidelity.md.
 
 Only histograms are kept, so that memory does not grow with the number of time steps.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -148,8 +147,8 @@ def follow(motion: str, steps: int, seed: int = 0) -> dict[str, Any]:
     }
 
 
-def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = RECORD) -> None:
-    """Run random actions and the expert; print and write the results, and fill the page."""
+def run(steps: int, describe: Callable[[], dict[str, Any]], write: bool) -> None:
+    """Run random actions and the expert; print, and with ``write`` replace record and page."""
     description = describe()
     results = {motion: follow(motion, steps) for motion in ("random", "expert")}
     for motion, found in results.items():
@@ -166,9 +165,8 @@ def run(steps: int, describe: Callable[[], dict[str, Any]], path: Path = RECORD)
             f"  FK elsewhere: max {1e3 * near['max']:.4f} mm ({near['samples']:,} time steps)\n"
             f"  tilt: max {np.rad2deg(tilt['max']):.2e} degrees"
         )
-    provenance.write_json(path, {**description, "results": results})
-    print(f"wrote {path.relative_to(ROOT)}")
-    if path == RECORD:
+    if write:
+        provenance.write_json(RECORD, {**description, "results": results})
         publish()
 
 

@@ -68,11 +68,12 @@ def policies() -> Iterator[str]:
         success = [100 * test["success_at_end"][name] for name in ("mean", "low", "high")]
         mean, low, high = success
         shown = " with demonstrations" if recipe["demonstrations"] else ""
+        elsewhere = f" on `{policy['env']}`" if policy["env"] != test["env"] else ""
         rows.append(
             [
                 f"`{test['env']}`",
                 f"{mean:.1f}% [{low:.1f}, {high:.1f}] of {test['episodes']:,}",
-                f"{policy['algorithm'].upper()}{shown}, {recipe['n_timesteps']:,} steps",
+                f"{policy['algorithm'].upper()}{shown}{elsewhere}, {recipe['n_timesteps']:,} steps",
             ]
         )
     yield from table(["policy", "success in PyBullet, 95% interval", "training"], rows)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import ctypes
 import gc
 import json
 import os
 import platform
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from tpm_gym.learning import provenance
 ROOT = Path(__file__).resolve().parents[1]
 
 _PACKAGES = ("panda-gym", "gymnasium-robotics", "mujoco")
+_WRITE = "--write"
 
 # -- the computer ---------------------------------------------------------------------------------
 
@@ -28,11 +30,12 @@ def describe(arguments: Sequence[str]) -> dict[str, Any]:
     """Describe the conditions of a measurement, without names of computers or folders.
 
     Args:
-        arguments: The script and its arguments.
+        arguments: The script and its arguments. ``--write`` is left out, so that a reader who
+            repeats the command replaces no page.
     """
     loads = os.getloadavg() if hasattr(os, "getloadavg") else None
     return {
-        "command": provenance.command_line(arguments),
+        "command": provenance.command_line([word for word in arguments if word != _WRITE]),
         "commit": provenance.git_commit(),
         "versions": provenance.versions() | {name: provenance.version(name) for name in _PACKAGES},
         "machine": provenance.machine(),
@@ -99,6 +102,29 @@ def open_files() -> int | None:
 
 
 # -- records and pages ----------------------------------------------------------------------------
+
+
+def make_parser(about: str) -> argparse.ArgumentParser:
+    """Return a parser with ``--write``, without which a benchmark only prints its results."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument(_WRITE, action="store_true", help="replace the record and fill its page")
+    return parser
+
+
+def publish(
+    record: dict[str, Any],
+    file: Path,
+    page: Path,
+    name: str,
+    lines: Callable[[dict[str, Any]], Iterable[str]],
+    *,
+    write: bool,
+) -> None:
+    """Print the lines of a record; with ``write``, replace the record's file and fill its page."""
+    print(*lines(record), sep="\n")
+    if write:
+        provenance.write_json(file, record)
+        fill(page, name, lines(read_record(file)))
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -9,9 +9,11 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from numpy.typing import NDArray
+from PIL import Image
 
 from tpm_gym import load_policy  # registers the ids as well
+from tpm_gym.learning.film import contact_sheet
 from tpm_gym.simulation import Camera
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
@@ -23,8 +25,8 @@ WIDTH, HEIGHT, SUPERSAMPLING = 400, 330, 3
 CAMERA = Camera((-0.05, -0.03, 0.105), 0.82, pitch=-16.0)
 
 
-def frames() -> dict[int, Image.Image]:
-    """Render the steps of an episode that FRAMES names."""
+def frames() -> dict[str, NDArray[np.uint8]]:
+    """Render the steps of an episode that FRAMES names, with their captions."""
     size = {"width": SUPERSAMPLING * WIDTH, "height": SUPERSAMPLING * HEIGHT}
     env = gym.make(ENV_ID, render_mode="rgb_array", camera=CAMERA, **size)
     observation, _ = env.reset(seed=0, options={"object": START, "goal": GOAL})
@@ -33,32 +35,19 @@ def frames() -> dict[int, Image.Image]:
     for step in range(max(FRAMES) + 1):
         if step in FRAMES:
             picture = Image.fromarray(np.asarray(env.render()))
-            pictures[step] = picture.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS)
+            picture = picture.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS)
+            caption = f"{CONTROL_PERIOD * step:.2f} s: {FRAMES[step]}"
+            pictures[caption] = np.asarray(picture)
         observation, *_ = env.step(policy.act(observation))
     env.close()
     return pictures
-
-
-def strip(pictures: dict[int, Image.Image]) -> Image.Image:
-    """Caption the frames, and put them side by side."""
-    font = ImageFont.load_default(size=18)
-    gap, caption = 8, 32
-    size = len(pictures) * (WIDTH + gap) - gap, HEIGHT + caption
-    sheet = Image.new("RGB", size, "white")
-    draw = ImageDraw.Draw(sheet)
-    for column, (step, picture) in enumerate(pictures.items()):
-        x = column * (WIDTH + gap)
-        sheet.paste(picture, (x, 0))
-        text = f"{CONTROL_PERIOD * step:.2f} s: {FRAMES[step]}"
-        draw.text((x + WIDTH / 2, HEIGHT + caption / 2), text, "black", font, anchor="mm")
-    return sheet
 
 
 def main() -> None:
     """Write docs/images/pick_and_place.png."""
     IMAGES.mkdir(exist_ok=True)
     path = IMAGES / "pick_and_place.png"
-    strip(frames()).save(path, optimize=True)
+    contact_sheet(frames(), columns=len(FRAMES)).save(path, optimize=True)
     print(path)
 
 

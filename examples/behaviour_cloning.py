@@ -1,8 +1,8 @@
 """Behaviour cloning: a network that imitates the expert's pick-and-place.
 
 One learns to collect observations and actions of the scripted expert in many environments at a
-time, and to test a network in them. It takes 40 s of a processor core. The expert, disturbed by
-noise, succeeded in 75.5% of the episodes, the network in 99.2%.
+time, and to test a network in them. It takes 21 s of a processor core. The expert, disturbed by
+noise, succeeded in 71.0% of the episodes, the network in 96.5%.
 """
 
 import sys

@@ -125,7 +125,7 @@ def _intervals(axes: Axes, of: Sequence[Frame]) -> None:
     for shift, engine in zip((-0.16, 0.16), ENGINES, strict=True):
         for row, (_, part) in enumerate(rows):
             found, colour = _successes(part, engine), _COLOURS[engine]
-            axes.plot([found.low, found.high], [row + shift] * 2, color=colour, lw=4, alpha=0.35)
+            axes.hlines(row + shift, found.low, found.high, colour, linewidth=4, alpha=0.35)
             axes.plot(found.mean, row + shift, "|", color=colour, ms=6, mew=1.6)
     axes.set_yticks(range(len(rows)), [name for name, _ in rows])
     axes.invert_yaxis()
@@ -143,6 +143,5 @@ def _profiles(axes: Axes, of: Sequence[Frame]) -> None:
         axes.step(limits, share, where="pre", color=_COLOURS[engine], label=label, linewidth=1.4)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(PercentFormatter(xmax=1, decimals=0))
-    axes.set_ylim(-0.03, 1.03)
     axes.set_xlabel("success of at least")
     axes.set_ylabel("share of runs")

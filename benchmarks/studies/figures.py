@@ -16,6 +16,7 @@ from tpm_gym.learning.figure_style import (
     ORANGE,
     OUTLINE,
     PURPLE,
+    REACHED,
     SKY,
     VERMILLION,
     WIDTH,
@@ -75,26 +76,36 @@ def learning_curves(runs: Frame) -> Figure:
                 axes.fill_between(curves.index, *band, color=colours[label], alpha=0.2, lw=0)
                 axes.plot(curves.median(axis=1), color=colours[label], label=label, linewidth=1.4)
         axes.axhline(LEARNED, **_LIMIT)
-        axes.set_xlim(left=0)  # so that steps of demonstrations show as a gap
+        start = min((min(curve) for curve in runs[runs["env"] == env]["curve"] if curve), default=0)
+        if start:
+            axes.axvspan(0, start, color=REACHED, lw=0)
+            text = axes.text(start / 2, 0.5, "demonstrations", color="0.4", rotation=90)
+            text.set(ha="center", va="center")
+        axes.set_xlim(left=0)
         axes.set_xlabel("environment steps")
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    figure.axes[0].set_ylabel("successful episodes")
+    for axes in panels[::_COLUMNS]:
+        axes.set_ylabel("successful episodes")
     _legend(figure, "median of the seeds, band from the least to the most successful")
     return figure
 
 
 def penalty(runs: Frame) -> Figure:
-    """Draw success and time below safe by penalty weight: a dot a seed, a bar at the mean."""
+    """Draw success and time below safe by penalty weight: a dot a seed, bars as in the table."""
     ids = sorted(runs["env"].unique())
     figure, panels = _grid(ids, "Goals that tempt towards the singularity", 2.4)
-    metrics = (("success_at_end", "success", BLUE), ("unsafe_share", "time below safe", VERMILLION))
+    metrics = (
+        ("success_at_end", "success, bar at the median", "median", BLUE),
+        ("unsafe_share", "time below safe, bar at the mean", "mean", VERMILLION),
+    )
     for env, axes in zip(ids, panels, strict=True):
         found = groups(runs[runs["env"] == env])
-        for place, (metric, label, colour) in zip((-0.16, 0.16), metrics, strict=True):
+        for place, (metric, label, middle, colour) in zip((-0.16, 0.16), metrics, strict=True):
             for index, group in enumerate(found):
                 values, x = group[f"pybullet.{metric}.mean"], index + place
                 axes.plot([x] * len(values), values, "o", color=colour, alpha=0.6, markersize=4)
-                axes.hlines(values.mean(), x - 0.12, x + 0.12, color=colour, linewidth=1.6)
+                bar = values.agg(middle)
+                axes.hlines(bar, x - 0.12, x + 0.12, color=colour, linewidth=1.6)
             axes.plot([], [], "o", color=colour, label=label)
         labels = [group["label"].iloc[0].replace(", ", "\n") for group in found]
         weights = [f"{group['penalty_weight'].iloc[0]:g}" for group in found]
@@ -103,7 +114,7 @@ def penalty(runs: Frame) -> Figure:
         axes.set_xlim(-0.5, len(found) - 0.5)
         axes.set_xticks(range(len(found)), weights)
         axes.set_xlabel("penalty weight")
-    _legend(figure, "a dot a seed, a bar at their mean")
+    _legend(figure, "a dot a seed")
     return figure
 
 
@@ -111,7 +122,7 @@ def robustness(bisections: Sequence[Record]) -> Figure:
     """Draw success against the size of a difference: a panel an attribute, a line an id."""
     attributes = [name for name in LIMITS if any(r["attribute"] == name for r in bisections)]
     names = [name.replace("_", " ") for name in attributes]
-    figure, panels = _grid(names, "Success of the published policies on machines that differ", 1.9)
+    figure, panels = _grid(names, "Success of the published policies on robots that differ", 1.9)
     colours = _colours(record["env"] for record in bisections)
     for attribute, axes in zip(attributes, panels, strict=True):
         for record in sorted(bisections, key=lambda r: (r["env"], r["engine"])):
@@ -127,7 +138,7 @@ def robustness(bisections: Sequence[Record]) -> Figure:
                     markersize=2.5,
                 )
         axes.axhline(0.5, **_LIMIT)
-        axes.set_xlabel(UNITS.get(attribute, "factor"))
+        axes.set_xlabel(UNITS.get(attribute, "factor, logarithmic"))
         if attribute not in UNITS:
             axes.set_xscale("log")
         ticks = sorted([nominal(attribute), *ends(attribute)])

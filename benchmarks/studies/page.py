@@ -9,10 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import jinja2
 import numpy as np
-import pandas as pd
 
+from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.provenance import write_whole
 from tpm_gym.mechanism import PAPER_TPM
@@ -21,6 +20,12 @@ from tpm_gym.simulation.randomisation import LIMITS
 from .bisection import SERVO_ATTRIBUTES, UNITS, ends, halving, nominal
 from .plan import Study, plan_runs
 from .records import RECORDS, Record, read_records
+
+try:
+    import jinja2
+    import pandas as pd
+except ImportError as error:
+    raise MissingPackageError(str(error.name), "studies") from error
 
 PAGE: Final = Path("docs", "results.md")
 RUNS: Final = "results-runs.md"

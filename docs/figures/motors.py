@@ -43,16 +43,16 @@ def table() -> tuple[FloatArray, FloatArray]:
 
 def motors_figure() -> Figure:
     """Draw a column for each motor: the links that it moves, and its shares."""
-    figure = Figure(figsize=(style.WIDTH, 5.0))
+    figure = Figure(figsize=(style.WIDTH, 4.4))
     at = {"ha": "center", "va": "top"}
     figure.text(0.5, 0.985, "Which motor moves what", fontsize=11, weight="bold", **at)
     what = "each motor turned alone, from the grey posture (4, 12 and 8°; not to scale)"
-    figure.text(0.5, 0.945, what, fontsize=8.5, **at)
+    figure.text(0.5, 0.94, what, fontsize=8.5, **at)
     lefts, width = (0.115, 0.375, 0.635), 0.25
     for motor, left in enumerate(lefts):
-        _posture(figure.add_axes((left - 0.01, 0.425, width + 0.02, 0.50)), motor)
+        _posture(figure.add_axes((left - 0.01, 0.44, width + 0.02, 0.43)), motor)
     values, counts = table()
-    axes = figure.add_axes((lefts[0], 0.055, lefts[2] + width - lefts[0], 0.33))
+    axes = figure.add_axes((lefts[0], 0.06, lefts[2] + width - lefts[0], 0.36))
     _table(axes, values, counts)
     return figure
 
@@ -74,7 +74,7 @@ def _posture(axes: Axes, motor: int) -> None:
     axes.plot(*project(POINT), "o", color="0.6", markersize=3.5, zorder=4)
     axes.plot(*p, "o", color=BLACK, markersize=3.5, zorder=4)
     axes.set_title(f"motor {motor + 1}", fontsize=9)
-    axes.set(xlim=(-0.68, 0.76), ylim=(-0.26, 1.02))
+    axes.set(xlim=(-0.68, 0.76), ylim=(-0.18, 0.84))
     axes.set_aspect("equal")
     axes.axis("off")
 
@@ -96,5 +96,5 @@ def _table(axes: Axes, values: FloatArray, counts: FloatArray) -> None:
         axes.text(-0.72, row, name, ha="right", va="center", weight="bold")
     for spine in axes.spines.values():
         spine.set_visible(False)
-    note = "its share in the motion of each coordinate: mean over the task region, case study"
+    note = "its share in the motion of each coordinate; all numbers are means over the task region"
     axes.set_xlabel(note, labelpad=5)

@@ -226,7 +226,7 @@ def _terms(env_id: str) -> list[str]:
 def _expert(ids: Sequence[str]) -> Iterator[str]:
     yield from ("## Expert", "")
     if solved(ids[0]) is None:
-        yield from ("This task has no scripted controller.", "")
+        yield from ("This task has no expert.", "")
         return
     yield from (
         f"Success of `tpm_gym.tasks.Expert` in {EPISODES} episodes of the analytic engine, "

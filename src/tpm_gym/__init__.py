@@ -52,7 +52,7 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def __getattr__(name: str) -> Any:
-    """``ENV_IDS``: all ids that are registered by now, in order."""
+    """Return ``ENV_IDS``: all ids that are registered by now, in order."""
     if name == "ENV_IDS":
         return env_ids()
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -100,7 +100,7 @@ def points(name: str, value: ArrayLike) -> FloatArray:
     else:
         array = array.double()
     if array.ndim == 0 or array.shape[-1] != 3:
-        raise InputError(name, tuple(array.shape), "an array of shape (..., 3), by shape")
+        raise InputError(f"shape of {name}", tuple(array.shape), "(..., 3)")
     return array  # type: ignore[no-any-return]
 
 

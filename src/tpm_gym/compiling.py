@@ -1,7 +1,7 @@
-"""Compile functions by Numba, and keep their machine code on disk.
+"""Compilation of functions by Numba; their machine code is kept on disk.
 
-Importing this module imports Numba, which takes some 0.3 s. Modules that compile are therefore
-imported when something is first computed.
+Importing this module imports Numba, which takes some 0.3 s. Modules with compiled functions are
+therefore imported only at the first computation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _CACHING: Any = caching
 PATIENCE: Final = 1.0
-"""Time of compiling without a message, s."""
+"""Time after which a message says that functions are being compiled, s."""
 _LOGGER: Final = logging.getLogger("tpm_gym")
 
 
@@ -47,8 +47,8 @@ def compiled(function: _Function) -> _Function:
 def kept(function: _Function) -> _Function:
     """Compile a function as :func:`compiled` does, and keep its machine code on disk.
 
-    It is compiled again when a source changes that is compiled into it, and when the file on disk
-    is damaged. Where no folder can be written, it is compiled in memory.
+    It is compiled again if any source that is compiled into it has changed, or if the file on disk
+    is damaged. If no folder can be written, it is compiled in memory.
     """
     dispatcher: Any = compiled(function)
     dispatcher._cache = _Cache(function)
@@ -56,19 +56,19 @@ def kept(function: _Function) -> _Function:
 
 
 class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has no types
-    """Numba's contents of a file, with the stamp of the function."""
+    """Content of a file in Numba's cache: machine code, with the stamp of its function."""
 
     stamp = ""
 
     def reduce(self, cres: Any) -> Any:
-        """Return what is written."""
+        """Return the stamp and Numba's data, which are written to the file."""
         return self.stamp, super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Return the machine code; None if it is of other sources.
+        """Return the machine code; None if other sources were compiled.
 
-        Numba writes a new index first, then the code. A process that is killed in between, or reads
-        in between, would take the code of other sources for this function's.
+        Numba writes a new index first, then the code. Until the code is written, or if the process
+        is killed before, the new index points to the code of older sources.
         """
         stamp, code = payload
         return super().rebuild(target_context, code) if stamp == self.stamp else None
@@ -77,14 +77,15 @@ class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has
 class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
     """Numba's files, found by stamp, signature and processor.
 
-    Numba also asks for an equal pickle of the closure. But the pickle of a function differs between
-    a process that reads its source and one that reads its bytecode. The stamp covers the closure.
+    Numba itself also compares a pickle of the function's closure. This class does not: the pickle
+    differs between a process that reads the source and one that reads its bytecode. The stamp
+    covers the closure.
     """
 
     _impl_class = _Code
 
     def renew(self, stamp: str) -> None:
-        """Set the stamp that files must have. Numba's own covers only the function's file."""
+        """Set the stamp that files must have; Numba's own stamp covers one source file only."""
         self._cache_file._source_stamp = self._impl.stamp = stamp
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
@@ -92,7 +93,7 @@ class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
 
 
 class _Cache:
-    """Numba's cache of a function, renewed with any of the function's sources; never raises."""
+    """Cache of a function's machine code, renewed if any of its sources changes; never raises."""
 
     _announced = False
 
@@ -151,19 +152,19 @@ class _Cache:
 
 _CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
 _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
-"""Packages whose functions are found by name; their sources are not read."""
+"""Packages whose functions enter a stamp by name only; their sources are not read."""
 
 
 def stamp(function: Callable[..., Any]) -> str:
     """Compute a hash of all that is compiled into a function: code, sources and constants."""
-    # The options of Numba are in this file.
+    # This file is included because it has the options of Numba.
     return hashlib.sha256("\n".join([_text(__file__), *_parts(function, {})]).encode()).hexdigest()
 
 
 def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield text that is equal in all processes if what a value refers to is equal.
+    """Yield text about a value that is equal in all processes if code and constants are equal.
 
-    The order counts: the same functions and constants in other places are another function.
+    The order counts, because the same parts in another order make another function.
     """
     value = getattr(value, "py_func", value)
     if isinstance(value, tuple):
@@ -187,9 +188,9 @@ def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
 
 
 def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield the source of a function, class or module, and what the function refers to.
+    """Yield the source of a function, class or module, then text about everything that it uses.
 
-    The code may be older than the source, which may have been edited since it was imported.
+    A function's bytecode is included, because its file may have been edited since the import.
     """
     module = str(value.__name__ if isinstance(value, ModuleType) else value.__module__)
     yield f"{module} {getattr(value, '__qualname__', '')}"
@@ -202,7 +203,7 @@ def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
     if inspect.isfunction(value):
         for used in (value.__code__, *_used(value)):
             yield from _parts(used, seen)
-    elif isinstance(value, ModuleType):  # a namespace: others call functions of it by name
+    elif isinstance(value, ModuleType):  # a namespace, whose functions are called by name
         for _, own in sorted(vars(value).items()):
             own = getattr(own, "py_func", own)
             if inspect.isfunction(own) and own.__module__ == module:
@@ -210,7 +211,7 @@ def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
 
 
 def _used(function: Any) -> Iterator[Any]:
-    """Yield the values of a function's names: globals, attributes of modules, closure, defaults."""
+    """Yield the values that a function uses: closure, defaults, globals, attributes of modules."""
     names, scope = set(_names(function.__code__)), function.__globals__
     yield from (cell.cell_contents for cell in function.__closure__ or ())
     yield function.__defaults__

@@ -97,7 +97,9 @@ class UnreachableError(TPMError, ValueError):
     def __str__(self) -> str:
         """Return the message."""
         shown = ", ".join(f"{value:.4g}" for value in self.point)
-        return f"({shown}) cannot be reached: {self.leg} fails by {-self.margin:.4g} m; {self.hint}"
+        far = f"{-self.margin:.4g} m"
+        reason = f"it is {far} outside" if self.leg == "box" else f"{self.leg} fails by {far}"
+        return f"({shown}) cannot be reached: {reason}; {self.hint}"
 
 
 @dataclass(eq=False)

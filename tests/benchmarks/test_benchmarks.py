@@ -1,12 +1,15 @@
 """The benchmarks of speed and endurance run, and find failures."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import bench_conveyor
 import bench_cycle
+import bench_shield
 import gymnasium as gym
 import pytest
+import shared
 import soak
 from paths import ROOT, read_strict
 from processes import PYTHON, printed_by
@@ -117,8 +120,9 @@ def test_a_run_without_policies_keeps_their_rows(times):
 
 def test_a_run_of_the_cycle_without_a_policy_keeps_its_rows(tmp_path, monkeypatch):
     seconds = {"expert": 0.25, "policy": 0.3}
-    for name in ("planned", "success", "fill", "lines"):
+    for name in ("planned", "success", "lines"):
         monkeypatch.setattr(bench_cycle, name, lambda *_: {})
+    monkeypatch.setattr(shared, "fill", lambda *_: None)
     monkeypatch.setattr(bench_cycle, "load_policy", lambda path: path)
     monkeypatch.setattr(bench_cycle, "RECORD", tmp_path / "cycle.json")
 
@@ -127,7 +131,44 @@ def test_a_run_of_the_cycle_without_a_policy_keeps_its_rows(tmp_path, monkeypatc
 
     monkeypatch.setattr(bench_cycle, "cycle", cycle)
     for words in ([], ["--policy", "best.json"], []):
-        bench_cycle.main(words)
+        bench_cycle.main([*words, "--write"])
         seconds["expert"] -= 0.05
     rows = read_strict(tmp_path / "cycle.json")["policy"]
     assert rows == [{"seconds": 0.3, "slower": 1.0}] * 3  # the expert has 0.15 s now
+
+
+# -- records and pages ----------------------------------------------------------------------------
+
+PAGE = "before <!-- shield: begin -->\nold\n<!-- shield: end --> after"
+
+
+@pytest.mark.parametrize("write", [False, True])
+def test_a_benchmark_replaces_record_and_page_only_if_told(write, tmp_path, monkeypatch, capsys):
+    record, page = tmp_path / "shield.json", tmp_path / "shield.md"
+    record.write_text('{"cost": {}}')
+    page.write_text(PAGE)
+    for module in (bench_shield, shared):
+        monkeypatch.setattr(module, "ROOT", tmp_path)
+    monkeypatch.setattr(bench_shield, "RECORD", record)
+    monkeypatch.setattr(bench_shield, "PAGE", page)
+    bench_shield.main(["--part", "soak", "--steps", "8000", *["--write"] * write])
+    table = capsys.readouterr().out
+    assert "`python benchmarks/bench_shield.py --part soak --steps 8000`" in table
+    assert "| TPMReachJoints-v0, wide | 2,000 |" in table
+    assert (page.read_text() != PAGE) == write
+    assert read_strict(record).keys() == ({"cost", "soak", "soak made by"} if write else {"cost"})
+
+
+SCRIPTS = [
+    file.name
+    for file in sorted((ROOT / "benchmarks").glob("*.py"))
+    if re.search(r"(?m)^def main", text := file.read_text(encoding="utf-8"))
+    and re.search(r"\bpublish\(|\bfill\(|docs/records", text)
+    and file.name not in ("shared.py", "bench_speed.py")
+]
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_a_target_of_make_gives_write(script):
+    assert "make_parser(" in (ROOT / "benchmarks" / script).read_text(encoding="utf-8")
+    assert re.search(rf"{script}.* --write\n", (ROOT / "Makefile").read_text(encoding="utf-8"))

@@ -1,5 +1,6 @@
 """Studies survive deaths and stops, and the page of results agrees with the records."""
 
+import importlib
 import json
 import re
 import signal
@@ -32,12 +33,20 @@ from studies.running import execute, run_all
 from trainings import PPO_RECIPE
 
 import tpm_gym
-from tpm_gym.errors import ConfigurationError
+from tpm_gym.errors import ConfigurationError, MissingPackageError
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.run_folder import claimed
 from tpm_gym.simulation.randomisation import LIMITS, Randomisation
 
 COMMAND = (PYTHON, "-m", "benchmarks.studies", "run")
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    monkeypatch.delitem(sys.modules, "studies.page")
+    with pytest.raises(MissingPackageError, match=r"needs pandas, .*'tpm-gym\[studies\]'"):
+        importlib.import_module("studies.page")
+
 
 # -- the plan -------------------------------------------------------------------------------------
 

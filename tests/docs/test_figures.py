@@ -103,14 +103,26 @@ def test_volume_agrees_with_random_points(sign):
 
 
 def test_signs_tell_the_aspects_of_a_half_apart_but_for_two():
-    """The figure of the aspects colours by signs, and names these two in its caption."""
+    """The figure of the aspects colours by signs, but the smaller of these two by its place."""
     found = aspects(ELBOWS_OUT, shape=(128, 8, 192))
     for sin_beta in (-1, 1):
         half = [regions.signs_of(a) for a in found if a.assembly.sin_beta == sin_beta]
         assert {signs[:2] for signs in half} == set(regions.COLOURS)
         assert len(half) == len(set(half)) + 1
-        assert half.count((-1, -1, -1)) == 2
-        assert len({tuple(regions.colour(signs)) for signs in half}) == len(set(half))
+        assert half.count(regions.SHARED) == 2
+        colours = [regions.colour(signs) for signs in set(half)]
+        assert len({*map(tuple, (*colours, regions.colour(regions.SHARED, True)))}) == len(half)
+
+
+def test_the_smaller_of_two_aspects_with_equal_signs_is_found_by_its_place():
+    found = aspects(ELBOWS_OUT, shape=(128, 8, 192))
+    half = [aspect for aspect in found if aspect.assembly.sin_beta > 0]
+    shared = [aspect.cells for aspect in half if regions.signs_of(aspect) == regions.SHARED]
+    large, little = sorted(shared, key=lambda cells: -cells.volume)
+    small = regions.smaller(half)
+    for sign in (1, -1):
+        assert small(little.centres() * (1, sign, 1)).all()
+        assert not small(large.centres() * (1, sign, 1)).any()
 
 
 def test_drawn_postures_of_both_modes_close_within_the_motors_stops():

@@ -80,6 +80,11 @@ def test_sparse_and_dense_ids_differ_in_nothing_but_the_reward():
             assert but_the_reward(env_id) == but_the_reward(dense)
 
 
+def test_nothing_is_printed_if_all_is_kept(capsys):
+    check_env(lambda: gym.make("TPMReach-v0", engine="analytic"))
+    assert capsys.readouterr() == ("", "")
+
+
 class Unseeded(Reach):
     """Draws from a generator of its own."""
 

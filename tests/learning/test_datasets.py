@@ -136,6 +136,10 @@ def test_options_of_the_environment_are_kept_and_named(tmp_path, monkeypatch):
     options = EnvOptions(engine="analytic", machine="wide", shield=True)
     (folder,) = collect(config(Path("sets"), "random", episodes=1, env_options=options), quiet())
     assert folder == Path("sets", REACH, "random-wide-shield-v0")
+    for shield, name in ((False, "random-v0"), (0.1, "random-shield0_1-v0")):
+        given = replace(options, machine=None, shield=shield)
+        chosen = config(Path("sets"), "random", env_options=given)
+        assert Dataset(chosen, REACH, "random", Path()).name == f"{REACH}/{name}"
     with closing(minari.MinariDataset(folder / "data").recover_environment()) as env:
         assert (env.unwrapped.machine.name, env.spec.kwargs["shield"]) == ("wide", True)
 

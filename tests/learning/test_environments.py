@@ -63,6 +63,11 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(tmp
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]
 
 
+def test_a_module_that_another_file_hides_is_named():
+    with pytest.raises(ConfigError, match=r"'json:TPMMine-v0'; the module is .*json.*py; if you"):
+        complete(TrainingConfig(env="json:TPMMine-v0"))
+
+
 def test_no_file_decides_what_is_imported(tmp_path, run, capsys):
     trace = tmp_path / "trace"
     (tmp_path / "my_tasks.py").write_text(f"{MODULE}\nopen({str(trace)!r}, 'w').close()")

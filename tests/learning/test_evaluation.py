@@ -26,6 +26,7 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning import EnvOptions, EvaluationConfig, evaluate, evaluation, provenance
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.errors import ConfigError, PolicyError
+from tpm_gym.learning.film import write_contact_sheet
 from tpm_gym.policy.files import digest
 from tpm_gym.tasks import Reach
 
@@ -122,7 +123,7 @@ def test_video_shows_the_first_episodes(short, tmp_path):
     assert (frames[0] != frames[-1]).any()  # and it moves
     assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 25
     assert [entry.name for entry in path.parent.iterdir()] == ["expert.mp4"]
-    assert f"video: {path}, 7 frames ..." in said(console)
+    assert f"video: {path}\n" in said(console)
 
 
 @pytest.mark.parametrize(
@@ -150,8 +151,29 @@ def test_picture_shows_six_moments_of_the_first_episode(short, tmp_path):
     env.close()
     picture = imageio.imread(path)
     height, width = first.shape[:2]
-    assert picture.shape == (2 * height, 3 * width, 3)
+    assert picture.shape[0] > 2 * height
+    assert picture.shape[1] > 3 * width
     np.testing.assert_array_equal(picture[:height, :width], first)
+    below = picture[height : picture.shape[0] // 2, :width]
+    assert below.min() < 50 < 200 < below.mean()  # the time, black on white
+
+
+def test_picture_shows_the_motion_at_the_start_of_a_long_episode(tmp_path):
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 40, (50, 24, 32, 3)).astype(np.uint8)
+    frames[:4] += np.array([200, 150, 100, 50], np.uint8)[:, None, None, None]
+    path = tmp_path / "reach.png"
+
+    def play(use):
+        for frame in frames:
+            use(frame)
+
+    write_contact_sheet(path, play, 25.0)
+    shown = imageio.imread(path)
+    left = [shown[row : row + 24, column : column + 32]
+            for row in (0, 24 + 32) for column in (0, 40, 80)]  # fmt: skip
+    for frame, expected in zip(left, (*frames[:4], None, frames[-1]), strict=True):
+        assert expected is None or (frame == expected).all()
 
 
 @pytest.mark.parametrize(
@@ -163,7 +185,7 @@ def test_picture_shows_six_moments_of_the_first_episode(short, tmp_path):
         (
             {"env": None, "policy": ("TPMReach-v0", "TPMPickAndPlace-v0")},
             ConfigError,
-            "differ in env: TPMReach-v0 .*, TPMPickAndPlace-v0 .*; choose one with --env",
+            "differ in env: TPMReach-v0 .*, TPMPickAndPlace-v0 .*; choose one, as in --env TPMR",
         ),
         ({"env": "TPMRech-v0"}, ConfigError, "TPMReach-v0"),
         ({"policy": ("expert", "gone.zip")}, PolicyError, "no file gone.zip"),
@@ -255,6 +277,31 @@ def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_gi
         evaluate(EvaluationConfig(both, episodes=1), quiet())
     chosen = EnvOptions("paper", drive="ideal")
     evaluate(EvaluationConfig(both, episodes=1, env_options=chosen), quiet())
+
+
+@pytest.mark.parametrize(
+    ("trained", "words", "expected"),
+    [
+        (True, [], "True"),
+        (0.1, [], "0.1"),
+        (True, ["--shield", "False"], None),
+        (True, ["--shield", "0.104"], "0.104"),
+        (False, ["--shield"], "True"),
+        (False, [], None),
+    ],
+)
+def test_the_shield_is_the_policys_unless_another_is_given(trained, words, expected, run, tmp_path):
+    shutil.copytree(run, tmp_path / "run")
+    path, out = tmp_path / "run" / "best.json", tmp_path / "out.json"
+    content = json.loads(path.read_text()) | {"env_options": {"shield": trained}}
+    path.write_text(json.dumps({**content, "sha256": digest(content)}))
+    words = [*words, "--engine", "analytic", "--episodes", "1", "--json", str(out)]
+    main(["evaluate", *words, "--policy", str(path)])
+    assert read_strict(out)["env_options"].get("shield") == expected
+    if trained is True and not expected:
+        both = (str(path), "TPMReach-v0")
+        with pytest.raises(ConfigError, match=r"in shield: True .*, False .*, as in --shield True"):
+            evaluate(EvaluationConfig(both, episodes=1), quiet())
 
 
 def test_an_exported_policy_goes_by_any_of_its_names(run):

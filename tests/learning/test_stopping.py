@@ -212,6 +212,9 @@ def test_a_kill_after_the_last_step_leaves_out_no_test(tmp_path, monkeypatch):
     console = quiet()
     assert resume(ResumeConfig(config.run), console) is None
     assert "success in the analytic engine and PyBullet" in said(console)
+    lines = evaluations(config.run)
+    best = max(lines, key=lambda line: (line["success_at_end"]["mean"], line["return"]["mean"]))
+    assert f"testing the best policy, of step {best['steps']}, in 1 held-out" in said(console)
     assert [line["steps"] for line in drawn.call_args.args[2]] == [0, 141, 282, 360]
     assert {path.stem for path in config.run.glob("tests/*.json")} == {"analytic", "pybullet"}
     before, console = contents(config.run), quiet()

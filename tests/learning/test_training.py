@@ -10,6 +10,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import gymnasium as gym
 import numpy as np
@@ -30,6 +31,7 @@ from tpm_gym.learning import (
     evaluate,
     resume,
     train,
+    training,
 )
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import complete
@@ -81,7 +83,7 @@ def test_steps_are_whole_rollouts_and_no_update_is_without_a_learning_rate(tmp_p
     console = quiet()
     train(replace(config, steps=100), console)
     assert "120 steps, in" in said(console)
-    assert "100 steps were asked for, and rounded up to whole rollouts of 40 steps" in said(console)
+    assert "100 steps were asked for, and rounded up to 120: 3 rollouts of 40" in said(console)
     rows = [row["train/learning_rate"] for row in table(config.run)]
     assert [float(rate) for rate in rows if rate] == pytest.approx([0.003, 0.002, 0.001])
     assert json.loads((config.run / "config.json").read_text())["steps"] == 120
@@ -242,7 +244,7 @@ PICK = {"env": "TPMPickAndPlace-v0", "recipe_file": recipe_file("sac")}
         ({"recipe_file": Path("none.yml"), "envs": 0}, "--envs 0: must be at least 1"),
         ({"randomisation": ("block_mass",)}, "--randomisation block_mass: must be KEY=NUMBER"),
         ({"seed": SELECTION_SEED - 2, "envs": 3}, "held out"),
-        ({"envs": 5}, "learning_starts: 100 is less than the 250 steps"),
+        ({"envs": 5}, "learning_starts: 100 is less than the 250 steps .* at most --envs 2"),
         ({"envs": 1001}, r"--envs 1001 \(n_envs of the recipe, .*at most 1,000"),
         ({"envs": 10**8, "env_options": EnvOptions(engine="analytic")}, "at most 1,000,000"),
         ({"steps": 1}, r"--steps 1: one rollout takes 2 \(1 environments x train_freq\)"),
@@ -264,6 +266,45 @@ def test_mistakes_are_named_before_anything_is_written(options, message, tmp_pat
     with pytest.raises(TPMError, match=message):
         train(replace(make_config("sac", tmp_path), **options), quiet())
     assert not (tmp_path / "run").exists()
+
+
+def test_demonstrations_are_counted_as_they_are_played(tmp_path):
+    """Each of two environments plays two episodes of 50 steps."""
+    config, console = make_config("sac in the analytic engine", tmp_path), quiet()
+    train(replace(config, steps=211, demonstrations=3, test_episodes=0), console)
+    assert "3 demonstrations were asked for, and rounded up to 4" in said(console)
+    assert "211 steps were asked for, and rounded up to 212: 200 of dem" in said(console)
+    assert json.loads((config.run / "config.json").read_text())["demonstrations"] == 4
+    assert complete(replace(config, envs=1)).demonstrations == 2
+    assert complete(replace(config, demonstrations=0)).demonstrations == 0
+
+
+@pytest.mark.parametrize(
+    ("env", "engine", "algo", "written_for"),
+    [
+        ("TPMReach-v0", None, "sac", "TPMReach-v0"),
+        ("TPMReachDense-v0", None, "ppo", "TPMReachDense-v0"),
+        ("TPMPickAndPlaceDense-v0", None, "sac", "TPMPickAndPlaceDense-v0"),
+        ("TPMPickAndPlaceDense-v0", "analytic", "ppo", "TPMPickAndPlaceDense-v0"),
+        ("TPMCrossing-v0", "analytic", "ppo", "TPMCrossing-v0"),
+        ("TPMStackDense-v0", "analytic", "ppo", "TPMPickAndPlaceDense-v0"),
+        ("TPMThrow-v0", None, "sac", "TPMPickAndPlace-v0"),
+    ],
+)
+def test_without_an_algorithm_one_that_has_a_recipe_is_taken(env, engine, algo, written_for):
+    config = complete(TrainingConfig(env=env, env_options=EnvOptions(engine=engine)))
+    assert (config.algo, config.recipe.written_for) == (algo, written_for)
+    assert config.run == Path(f"runs/{env}-{algo}-s0")
+
+
+def test_a_recipe_of_another_task_is_announced_with_that_of_the_id(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "_Session", Mock())
+    config, console = TrainingConfig("sac", "TPMReachDense-v0", run=tmp_path / "run"), quiet()
+    train(replace(config, steps=60_000), console)
+    assert (
+        "note: the recipe of sac is that of TPMPickAndPlaceDense-v0; the id has one with --algo "
+        "ppo; give your own with --recipe FILE"
+    ) in said(console)
 
 
 def test_demonstrations_are_as_many_as_asked_for(tmp_path):

@@ -7,6 +7,7 @@ import pytest
 import yaml
 from processes import PYTHON, printed_by
 
+from tpm_gym.learning import provenance
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
 from tpm_gym.learning.run_folder import evaluations
@@ -51,6 +52,13 @@ def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path):
 def test_mistakes_are_named_before_ray_starts(words, message):
     with pytest.raises(SystemExit, match=message):
         main(["tune", *words])
+
+
+def test_a_missing_package_is_named_before_anything_is_said(monkeypatch, capsys):
+    monkeypatch.setattr(provenance, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit, match=r"needs ray, .*'tpm-gym\[cluster\]'"):
+        main(["tune", "--engine", "analytic"])
+    assert capsys.readouterr().out == ""
 
 
 def test_a_cluster_is_joined_with_the_cores_that_it_has(tmp_path, monkeypatch):

@@ -129,9 +129,9 @@ def test_joined_entries_come_in_the_order_on_file(tmp_path):
     ("changes", "message"),
     [
         ({"observation": torch.zeros(4, requires_grad=True)}, "observation must be real numbers"),
-        ({"observation": np.zeros(5)}, r"observation must be of shape \(4,\)"),
-        ({"observation": np.zeros((2, 2, 4))}, "observation must be of shape"),
-        ({"observation": 1.0}, "observation must be of shape"),
+        ({"observation": np.zeros(5)}, r"shape of observation must be \(4,\) or \(n, 4\), "),
+        ({"observation": np.zeros((2, 2, 4))}, "shape of observation must be"),
+        ({"observation": 1.0}, "shape of observation must be"),
         ({"observation": np.zeros((3, 4))}, "of one batch size in all"),
         ({"observation": ["a", "b", "c", "d"]}, "observation must be real numbers"),
         ({"observation": [0, 0, np.nan, 0]}, "observation must be finite in float32, got nan"),

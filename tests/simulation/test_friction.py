@@ -176,7 +176,7 @@ def test_two_objects_slide_their_own_ways_at_once(engine):
 @each_engine
 @pytest.mark.parametrize("spin", [10.0, 30.0, 60.0])  # rad/s
 def test_what_spins_on_the_spot_is_braked_at_its_corners_and_does_not_take_off(engine, spin):
-    # PyBullet: 2 to 23% too far, for all corners share one direction of friction. MuJoCo: 0.01 and
+    # PyBullet: 0 to 12% too far, for added friction is of the last time step. MuJoCo: 0.01 and
     # 0.02 rad too far, for the load comes onto the corners late.
     simulation, rates = start(engine, BLOCK), list[float]()
     heights: list[float] = []
@@ -195,17 +195,15 @@ def test_what_spins_on_the_spot_is_braked_at_its_corners_and_does_not_take_off(e
     if engine == "mujoco":
         assert turned == pytest.approx(exact, abs=0.05)
     else:
-        assert 0.95 < turned / (exact - spin * step / 2) < 1.25
+        assert 0.98 < turned / (exact - spin * step / 2) < 1.14
     assert abs(rates[-1]) < 1e-4
     assert max(heights) < BLOCK.height / 2 + 2e-5
 
 
-@pytest.mark.parametrize(
-    ("engine", "degrees", "share"),  # PyBullet has its own box there
-    [("pybullet", 0.0, 1.0), ("pybullet", 22.5, 0.86), ("pybullet", 45.0, 0.70)]
-    + [("mujoco", degrees, 1.0) for degrees in DIRECTIONS],
-)
-def test_what_slides_on_another_object_is_braked_against_its_way(engine, degrees, share):
+@pytest.mark.parametrize("degrees", DIRECTIONS)
+@pytest.mark.parametrize(("engine", "off"), [("pybullet", 0.05), ("mujoco", 0.01)])
+def test_what_slides_on_another_object_is_braked_against_its_way(engine, off, degrees):
+    # PyBullet: 4% too short, for the first time step still has the box (box: 30%, 10 degrees off).
     simulation = Alone(Scene(objects=(BLOCK, BASE)), engine=engine)
     where = {BLOCK.name: (*AWAY[0], BASE.height + BLOCK.height / 2), BASE.name: (*AWAY[0], 0.010)}
     simulation.reset(PAPER_TPM.inverse(level(0.05)), where)
@@ -215,8 +213,25 @@ def test_what_slides_on_another_object_is_braked_against_its_way(engine, degrees
     rest(simulation, 8)
     stop = way_to_stop(simulation, 0.6, BLOCK.friction * BASE.friction * G)
     way = place_of(simulation) - begin
-    assert np.linalg.norm(way[:2]) == pytest.approx(share * stop, rel=0.02)
-    assert engine == "pybullet" or angle(way[:2], unit(degrees)[:2]) < 1
+    assert np.linalg.norm(way[:2]) == pytest.approx(stop, rel=off)
+    assert angle(way[:2], unit(degrees)[:2]) < 2
+
+
+@pytest.mark.parametrize(
+    ("velocity", "spin"), [((0.3, 0.3, 0.0), 15.0), ((0.5, 0.0, 0.0), 25.0), ((0.3, 0.0, 0.0), 8.0)]
+)
+def test_what_slides_and_spins_goes_the_same_way_in_both_engines(velocity, spin):
+    # With scales alone, PyBullet was up to 3.7 mm and 0.25 rad off.
+    ends = []
+    for engine in ("pybullet", "mujoco"):
+        simulation = start(engine, BLOCK)
+        begin = place_of(simulation)
+        throw(simulation, velocity, spin)
+        quaternion = rest(simulation, 8).object_quaternion[0]
+        ends.append((*(place_of(simulation) - begin)[:2], 2 * math.asin(quaternion[2])))
+    (x, y, turn), (u, v, exact) = ends
+    assert math.hypot(x - u, y - v) < 0.0015
+    assert turn == pytest.approx(exact, rel=0.12)
 
 
 @each_engine
@@ -251,6 +266,26 @@ def test_a_side_that_the_lip_pushes_goes_along_with_the_lip(engine, sideways):
     turning = np.cross(state.object_angular_velocity[0], arm)
     side = state.object_velocity[0] + turning
     assert side[1] == pytest.approx(sideways / 0.040, rel=0.1)
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
+def test_a_block_that_another_pushes_goes_along_with_it(engine):
+    """[It stayed behind by half, as on ice.]"""
+    mount, half = PAPER_TPM.mount, BLOCK.height / 2
+    heavy = Block("heavy", width=0.06, mass=0.3)
+    x, y, _ = mount.to_world(PAPER_TPM.home)
+    place = np.array([x - 0.05, y, 2 * half - 0.010 + CUP.length])
+    simulation = Alone(Scene(objects=(BLOCK, heavy)), engine=engine)
+    where = {BLOCK.name: (x, y, half), heavy.name: (x + 0.05, y, heavy.height / 2)}
+    simulation.reset(PAPER_TPM.inverse(mount.to_paper(place)), where)
+    for step in range(9):
+        place = place + (0.012, 0.0 if step < 6 else 0.002, 0.0)
+        state = simulation.move(mount.to_paper(place))
+    touch = state.object_position[0] + (BLOCK.width / 2, 0.0, 0.0)
+    arms = touch - state.object_position
+    one, other = state.object_velocity + np.cross(state.object_angular_velocity, arms)
+    assert one[1] > 0.02
+    assert other[1] == pytest.approx(one[1], rel=0.05)
 
 
 @each_engine

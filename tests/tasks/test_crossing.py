@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from machines import each_machine
 from numpy.testing import assert_allclose
+from paths import ROOT
 from states import apart
 
 from tpm_gym import PAPER_TPM, WIDE_TPM, TPMEnv, TPMVectorEnv
@@ -226,6 +227,15 @@ def moving(
 
     end, _ = integrate(BOTH, None, steps, count, course, step, touch)
     return end.position, (end.position - end.before) / step, end.theta
+
+
+@pytest.mark.parametrize("page", ["crossing.md", "operation-modes-singularities.md"])
+def test_torque_beside_the_plane_is_that_of_the_pages(page):
+    at, step = np.array([PAPER_TPM.home[0], 0.25e-3, PAPER_TPM.home[2]]), np.array([0, 1e-7, 0])
+    theta = PAPER_TPM.reach(np.stack([at, at - step, at + step]))
+    acceleration = (theta[2] - theta[1]) / 2e-7  # of the joints, for 1 m/s^2 of P along y
+    torque = np.abs(PAPER_TPM.torque(theta[0], np.zeros(3), acceleration)).max()
+    assert f"{torque:.0f} N m at 0.25 mm" in (ROOT / "docs" / page).read_text(encoding="utf-8")
 
 
 def test_dynamics_of_p_are_those_of_the_joints():

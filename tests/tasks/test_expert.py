@@ -16,7 +16,8 @@ import tpm_gym
 from tpm_gym import TPMEnv
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.tasks import Expert, Motion, Move, Reach
+from tpm_gym.simulation.state import Block, Scene
+from tpm_gym.tasks import Expert, Motion, Move, PickAndPlace, Reach, Stack
 
 PLACES = [
     *({"machine": name} for name in ("paper", "wide", "gantry")),
@@ -204,6 +205,36 @@ def test_it_lets_go_of_a_block_just_above_the_table(engine):
     assert max(heights) > 0.01
     assert -5e-5 < heights[-1] < 2e-4
     env.close()
+
+
+class Red(PickAndPlace):
+    """Its block has a name of its own."""
+
+    block = Block("red")
+    scene = Scene((block,))
+
+    def sample(self, rngs: Any, chosen: Any) -> Any:
+        start = super().sample(rngs, {})
+        return {"red": start["object"], "goal": start["goal"]}
+
+
+class RedToo(Stack):
+    """It does not say which block."""
+
+    def plan(self, motion: Motion) -> Iterator[Any]:
+        yield Move(motion.carried_to(motion.goal[:3]), False)
+
+
+def test_the_only_block_needs_no_name():
+    env = TPMEnv(Red, engine="analytic")
+    expert, (observation, _) = Expert(env), env.reset(seed=0)
+    for _ in range(50):
+        observation, *_, info = env.step(expert.act(observation))
+    assert info["is_success"]
+    several = TPMEnv(RedToo, engine="analytic")
+    observation, _ = several.reset(seed=0)
+    with pytest.raises(ConfigurationError, match=r"name = None .* one of lower, upper"):
+        Expert(several).act(observation)
 
 
 class Planned(Reach):

@@ -65,6 +65,14 @@ def test_sampled_ends_are_safe_apart_and_spread(kind, machine):
         assert (np.ptp(starts[:, :2], axis=0) > 0.8 * edges[:2]).all()
 
 
+def test_a_region_is_a_list_of_one() -> None:
+    region, found = PAPER_TPM.goal_region, []
+    for part in (region, [region]):
+        rngs = [np.random.default_rng(0)]
+        found.append(safe_points(rngs, PAPER_TPM, {"goal": part}, {})["goal"])
+    np.testing.assert_array_equal(*found)
+
+
 def test_points_are_drawn_by_the_rows_own_generator_and_apart_from_all_others() -> None:
     regions = {name: [PAPER_TPM.region, PAPER_TPM.goal_region] for name in "abc"}
     low, high = PAPER_TPM.region.low, PAPER_TPM.region.high

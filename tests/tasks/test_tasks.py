@@ -280,6 +280,27 @@ def test_a_method_that_mixes_robots_is_refused_by_name(method, value, blamed):
         assert caught.value.name == blamed
 
 
+class Forgetful(Reach):
+    """Its reward depends on the calls before."""
+
+    calls = 0
+
+    def shaping(self, state: State) -> Any:
+        self.calls += 1
+        return {"n": np.full(len(state.held), -float(self.calls))}
+
+
+def test_a_task_that_remembers_is_refused_as_such():
+    found = r"shaping\(\)\['n'\] = '-\d.0 among 7 robots, -\d.0 alone' .*store nothing in the task"
+    with pytest.raises(ConfigurationError, match=found):
+        TPMEnv(Forgetful, engine="analytic")
+
+
+def test_a_task_without_a_scene_is_refused():
+    with pytest.raises(ConfigurationError, match=r"scene = None .*a Scene; Scene\(\) has no obj"):
+        TPMEnv(type("Sceneless", (Reach,), {"scene": None}), engine="analytic")
+
+
 # -- made by name, copied --------------------------------------------------------------------------
 
 

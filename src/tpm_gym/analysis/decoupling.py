@@ -29,7 +29,10 @@ PLATFORM = np.array([[True, True, True], [True, True, True], [True, True, False]
 """Entries of J that are not always zero: rows x, y, z of P, columns motors 1, 2, 3."""
 
 LINKS = np.array([[True, True, False], [True, True, False], [True, True, True]])
-"""Entries that are not always zero: rows xC, zC of link 3' and beta of link 7; also the inverse."""
+"""Entries that are not always zero: rows xC, zC of link 3' and beta of link 7, columns motors.
+
+The inverse matrix has the same entries.
+"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,7 @@ class Aspect:
 
     Attributes:
         assembly: Assembly mode, the sign of det A.
-        constraint: Sign of the volume of the normals of the parallelograms.
+        constraint: Sign of det [n1 n2 n3], the normals of the parallelograms.
         cells: Cells of the region.
     """
 

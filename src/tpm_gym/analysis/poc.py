@@ -7,7 +7,7 @@ intersection the common subspace, separately for translations and rotations, as 
 contributes t along s x (o' - p), unless the axis passes through the base point o' of the end link.
 
 Subspaces replace the paper's symbols for directions. Choose the base point so that no element is
-dependent; there is no notation for dependent elements, as the paper's braces. The sets are exact
+dependent; there is no notation for dependent elements (the paper has braces). The sets are exact
 for chains that translate and rotate independently, as all chains of this mechanism do. They
 describe one configuration. Dimensions can change at a singularity; elsewhere they are the full-
 cycle values of the paper.
@@ -47,7 +47,7 @@ class Subspace:
         rows = numbers("vectors", vectors)
         rows = finite_points("vectors", rows if rows.size else rows.reshape(0, 3))
         if rows.ndim != 2:
-            raise InputError("vectors", rows.shape, "an array of shape (n, 3), by shape")
+            raise InputError("shape of vectors", rows.shape, "(n, 3)")
         lengths = np.hypot.reduce(rows, axis=1)  # without overflow
         rows = rows[lengths > _SAME] / lengths[lengths > _SAME, None]
         _, values, right = np.linalg.svd(rows)
@@ -288,7 +288,10 @@ def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
 
 
 def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
-    """Return the independent loops for each order of the chains, about ``point`` (3,) m."""
+    """Return the independent loops, for each order in which the chains can be joined.
+
+    Motions are those of ``point``, (3,) m.
+    """
     return tuple(_loops(order) for order in permutations([(c, c.poc(point)) for c in chains]))
 
 

@@ -239,7 +239,7 @@ def nearest(
 def _feet(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, g: Geometry, name: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the points that a surface may be near: their rows, distances and feet."""
+    """Return the points that may be near a surface: their rows, distances from it, and feet."""
     arcs, (x, z, p, q), length = _arcs(g, mode, name)
     link3 = points - [g.l2, 0, 2 * g.l6]  # C1 for a link 7 of length 0
 

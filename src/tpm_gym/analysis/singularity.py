@@ -67,7 +67,7 @@ class Classification:
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """Nearest singular position of each point; NaN (-1 for factor) where not valid.
+    """Nearest singular position of each point; NaN where not valid, and -1 as its factor.
 
     Attributes:
         distance: (...,) m.
@@ -83,7 +83,7 @@ class NearestSingularity:
 
 
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
-    """Divide the factors by lengths, so that one tolerance suits all; return (..., 8).
+    """Divide the factors by lengths, (..., 8), so that one tolerance suits all.
 
     level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
     """
@@ -99,8 +99,9 @@ def classify(
 ) -> Classification:
     """Classify joint angles theta (..., 3) rad (section "Singularity analysis").
 
-    A dimensionless factor counts as zero up to ``tolerance``. Use 1e-7 or more: a factor that
-    merges two branches is computed from joint angles to the square root of rounding only.
+    A dimensionless factor counts as zero up to ``tolerance``. Use 1e-7 or more: where two branches
+    merge, a factor computed from joint angles has an error of about the square root of the
+    rounding error.
     """
     return _classify(factors(numbers("theta", theta), branch, geometry), geometry, tolerance)
 

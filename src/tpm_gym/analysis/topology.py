@@ -3,8 +3,8 @@
 Two independent counts of the degrees of freedom start from the axes of the joints:
 
 * :func:`analyse` applies Eqs. (1) to (5) to branches I, II, III and the pair R12, R13.
-* :func:`mobility` computes the rank of the closure Jacobian of the spanning tree and point closures
-  that the simulator loads, with all rods and balls of the parallelograms.
+* :func:`mobility` computes the rank of the closure Jacobian of the mechanism that engines load,
+  with all rods and balls of the parallelograms.
 
 Both agree at singularities too. If z_C1 = z_B1, both find 4 instantaneous freedoms, because link 3'
 can begin to turn about y. Vectors are in the paper frame. Functions of joint angles take three
@@ -96,7 +96,8 @@ class Topology(poc.ParallelMechanism):
 
     Attributes:
         sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' on branches I and II.
-        hsoc_1: POC set of the platform on branches I, II with R12, R13; ``hsoc_2``: on III.
+        hsoc_1: POC set of the platform on branches I and II with R12, R13.
+        hsoc_2: POC set of the platform on branch III.
     """
 
     sub_mechanism: POCSet
@@ -122,9 +123,9 @@ class Mobility:
 
     Attributes:
         dof: Freedoms that move the platform or a motor.
-        idle: Freedoms that move neither: end link 10 rolls about its own axis, R33.
+        idle: Freedoms that move neither. The TPM has one: end link 10 turns about its axis, R33.
         rank: Rank of the closure Jacobian.
-        redundant: Number of dependent rows.
+        redundant: Number of dependent rows of the closure Jacobian.
         smallest: Smallest singular value that is not zero, as a fraction of the largest.
         platform: POC set of the platform: all directions in which the loops let it move.
     """
@@ -150,7 +151,10 @@ def mobility(
 
 
 def mobility_at(mechanism: Mechanism, angles: Mapping[str, float]) -> Mobility:
-    """Count freedoms like :func:`mobility`, of any mechanism, from the angle of each joint, rad."""
+    """Count the freedoms of any mechanism like :func:`mobility`.
+
+    ``angles`` has the position of each joint by name, rad (m for a slide).
+    """
     jacobian = closure_jacobian(mechanism, angles)
     _, values, right = np.linalg.svd(jacobian)
     rank = rank_of(values)

@@ -51,7 +51,7 @@ INFO: Final = {
 """Types of the entries of every info by name; the task's events are further entries."""
 
 _TAKEN: Final = ("randomisation", "final_obs", "final_info", "episode")
-"""Further entries that this package and Gymnasium add to infos."""
+"""Other names of info entries that a task must not use: this package or Gymnasium adds them."""
 
 Observation = dict[str, Any]  # arrays of float32
 Report = tuple[Observation, FloatArray, dict[str, Any]]
@@ -364,7 +364,7 @@ class Core:
         return EnvSnapshot(self.kind, self._save_simulation(), rngs, copies)
 
     def _save_simulation(self) -> Snapshot:
-        """Return a snapshot; :attr:`state` is that of the restarted simulation then."""
+        """Return a snapshot; read :attr:`state` again, since saving restarts the simulation."""
         snapshot = self.simulation.save()
         self._state = self.simulation.state()
         self._newest = _view(self._state)[None]
@@ -465,7 +465,7 @@ def _box(bound: float, length: int) -> spaces.Box:
 
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:
-    """Add the reward's terms that do not depend on the goal."""
+    """Return the sum of the reward terms that do not depend on the goal."""
     total: Any = 0.0
     for name, value in terms.items():
         if name != "goal":
@@ -511,7 +511,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
 
 
 def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
-    """Refuse arrays that are no batch of goals; goals that are not finite are no success."""
+    """Refuse arrays that are no batch of goals; goals that are not finite count as no success."""
     shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
     try:
         np.broadcast_shapes(*shapes)
@@ -519,5 +519,5 @@ def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
     except ValueError:
         fit = False
     if not fit:
-        valid = f"of shapes (..., {size}) that go together, by shape"
+        valid = f"of shapes (..., {size}) that go together"
         raise InputError("achieved_goal, desired_goal", shapes, valid)

@@ -25,9 +25,10 @@ VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:TPMVectorEnv"
 def register_task(
     name: str, task: type[Task], *, version: int = 0, max_episode_steps: int | None = None
 ) -> tuple[str, ...]:
-    """Register a task's ids ``TPM<name>{,Joints}{,Dense}-v<version>``; it may be repeated.
+    """Register a task's ids ``TPM<name>{,Joints}{,Dense}-v<version>``.
 
-    Ids with ``Joints`` are registered if ``task.controls`` has joint control.
+    Ids with ``Joints`` are registered if ``task.controls`` has joint control. An equal second call
+    changes nothing.
 
     ``TPMEnv(task=...)`` accepts ``name`` in snake case. The command line, and worker processes that
     are spawned rather than forked, need ``"module:id"``: importing the module registers the id.
@@ -95,7 +96,8 @@ def _built_in() -> Iterator[type[Task]]:
     """Yield the task classes in the files of :mod:`tpm_gym.tasks`."""
     for _, name, _ in pkgutil.iter_modules(tasks.__path__, f"{tasks.__name__}."):
         for value in vars(importlib.import_module(name)).values():
-            # The module first: Python 3.10 takes list[int] for a type, issubclass does not.
+            # The module is compared first, since issubclass would raise on an imported list[int],
+            # which isinstance takes for a type in Python 3.10.
             ours = getattr(value, "__module__", None) == name and isinstance(value, type)
             if ours and issubclass(value, Task) and not isabstract(value):
                 yield value

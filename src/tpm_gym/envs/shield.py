@@ -1,17 +1,19 @@
 """Shield: the nearest command that keeps the machine away from singularities.
 
 Let c be the last command, d the next one, and m the middle of the last two commands. In a control
-period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If d is held
-then, P moves on to d in a straight line. The command d is safe if the conditioning 1/cond(J) stays
-at ``least`` or above on both. So it is always safe to hold the last command.
+period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If the
+command then stays at d, P moves on to d in a straight line. The command d is safe if the
+conditioning 1/cond(J) stays at ``least`` or above on curve and line. So it is always safe to hold
+the last command.
 
 Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex.
 Therefore the nearest command is mostly the nearest point of the surface ``conditioning = least``.
 It is found by sequential quadratic programming, and the path is checked. Where the check fails, the
-aim is raised, and at last the command is moved towards the last one.
+search is repeated with a larger conditioning as its aim. Where that fails too, the command is moved
+towards the last one.
 
 Where a task bounds the accelerations of commands, a robot cannot hold the last command at once.
-There :class:`BrakingShield` asks that the robot can still brake in time.
+There :class:`BrakingShield` allows only commands after which the robot can still brake in time.
 
 Importing this module imports Numba.
 """
@@ -33,38 +35,41 @@ from tpm_gym.tasks.control import Control, Follower
 __all__ = ["BrakingShield", "Shield", "make_shield"]
 
 MARGIN = 0.15
-"""Fraction of the safe conditioning that is kept besides with servo drives or other plants."""
+"""Extra conditioning to keep with servo drives or other plants, as a fraction of the safe one."""
 TOLERANCE = 2e-5
-"""Conditioning above ``least`` that is aimed at; half of it remains for the path between nodes."""
+"""Conditioning above ``least`` that is wanted at commands.
+
+The check of a path demands half of it; the other half is for errors between the nodes.
+"""
 _FAR = 1.05
-"""Times ``least``: three commands with more conditioning have a safe path between them."""
-_STEPS = 6  # of sequential quadratic programming, at most
-_CLOSE = 0.005  # last step, in units of the action: the next one would be a hundredth
-_ROUNDS = 3  # of raising the aim where the path is less safe than its ends
+"""Factor of ``least``; the path between three commands with more conditioning is safe."""
+_STEPS = 6  # largest number of steps of sequential quadratic programming
+_CLOSE = 0.005  # step, in units of the action, that ends the search: the next is 100 times smaller
+_ROUNDS = 3  # largest number of times that the aim is raised, if a path is less safe than its ends
 _HALVINGS = 20
 _PARTINGS = 8  # halvings between braking and the wanted command
-_LONGEST = 200  # control steps until a robot that brakes is at rest, at most
-_SWEEPS = 200  # of the quadratic program, at most
-_NUDGE = 1e-4  # of a step, for derivatives of the conditioning
+_LONGEST = 200  # largest number of control steps until a robot that brakes is at rest
+_SWEEPS = 200  # largest number of sweeps over the constraints of a quadratic program
+_NUDGE = 1e-4  # displacement for derivatives of the conditioning, as a fraction of the step limit
 
 
 @cache
 def _nodes() -> FloatArray:
-    """Return weights (7, 3) of m, c, d for points on curve and line: one parabola in turn."""
+    """Return weights (7, 3) of m, c and d for seven points: five on the curve, two on the line."""
     s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
     curve = np.hstack([(1 - s) ** 2, 2 * s * (1 - s) + s**2 / 2, s**2 / 2])
     return np.vstack([curve, [[0.0, 0.25, 0.75], [0.0, 0.0, 1.0]]])
 
 
 class Problem(NamedTuple):
-    """Nearest safe commands of r robots that are looked for.
+    """Search for the nearest safe commands of r robots.
 
     Attributes:
         wanted: (r, 3) wanted commands, in units of the action.
         last: (r, 3) last commands, in units of the action.
         low: (r, 3) m, lower corner of the commands that the control can give.
         high: (r, 3) m, upper corner.
-        aim: (r,) conditioning at the commands.
+        aim: (r,) conditioning that the commands have to reach.
     """
 
     wanted: FloatArray
@@ -75,11 +80,11 @@ class Problem(NamedTuple):
 
 
 class Shield:
-    """Replacement of unsafe commands by the nearest safe ones, for n robots.
+    """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
-    Distances between commands are Euclidean, in units of the action: of increments of P with
-    Cartesian control, of the joints with joint control. What the control cuts off from an action
-    does not count. A nearer safe command is nearer by some 0.001 at most.
+    Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
+    control, increments of the joints with joint control. They are measured from the command to
+    which the control converts the action. No safe command is nearer by more than about 0.001.
 
     Args:
         machine: Nominal machine.
@@ -88,12 +93,12 @@ class Shield:
     """
 
     def __init__(self, machine: Machine, control: Control, least: float) -> None:
-        """Keep the arguments."""
+        """Store the arguments."""
         self._machine, self._control, self.least = machine, control, least
         self._step = np.array(machine.step_limit)
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
-        # The last commands, and how many in turn have been far from the border: a cache, so that
-        # these commands are not computed again.
+        # A cache: the last commands, and how many successive commands were far from the border. The
+        # path of three such commands is safe, and is not checked.
         self._last: FloatArray = np.empty((0, 2, 3))
         self._far = np.empty(0, dtype=np.int64)
 
@@ -122,7 +127,7 @@ class Shield:
         return command
 
     def _lack(self, corners: FloatArray) -> FloatArray:
-        """Return the conditioning (r,) that the path with corners (r, 3, 3) m, c, d lacks."""
+        """Return by how much (r,) paths are not safe; their corners m, c, d are (r, 3, 3) m."""
         return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
@@ -180,12 +185,12 @@ class Shield:
 
 
 class BrakingShield:
-    """Replacement of commands after which robots could not brake in time, for n robots.
+    """Shield of Cycle: replaces commands after which robots could not brake in time.
 
     A command is safe if the conditioning stays at ``least`` or above on its path, and while the
     robot brakes after it as hard as the follower allows. No torque may exceed the motors' peak. So
     it is always safe to brake, because the rest of the last braking is safe. An unsafe command is
-    moved towards the command of braking, in a straight line.
+    moved in a straight line towards the command with which the robot brakes.
 
     Args:
         machine: Nominal machine.
@@ -194,7 +199,7 @@ class BrakingShield:
     """
 
     def __init__(self, machine: Machine, follower: Follower, least: float) -> None:
-        """Keep the arguments."""
+        """Store the arguments."""
         self._machine, self._follower, self.least = machine, follower, least
 
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
@@ -225,7 +230,7 @@ class BrakingShield:
         return command
 
     def _lowest(self, command: FloatArray, recent: FloatArray) -> FloatArray:
-        """Return the smallest conditioning (r,) until robots that get a command and brake rest."""
+        """Return the smallest conditioning (r,) if robots get a command and then brake to rest."""
         found: FloatArray = np.full(len(command), np.inf)
         rows, (before, current), then = np.arange(len(command)), recent.swapaxes(0, 1), command
         for _ in range(_LONGEST):
@@ -252,7 +257,7 @@ def make_shield(
         machine: Nominal machine.
         control: Control of the environment.
         follower: Limit of its commands, if their accelerations are bounded.
-        exact: Whether the robot follows its commands exactly; else True keeps a ``MARGIN``.
+        exact: Whether the robot follows its commands exactly. If not, True adds the ``MARGIN``.
 
     Raises:
         ConfigurationError: If the option is neither True nor a conditioning below home's, or the
@@ -277,7 +282,7 @@ def make_shield(
 
 
 def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
-    """Return the smallest conditioning (r,) on paths with the corners (r, 3, 3) m, c, d."""
+    """Return the smallest conditioning (r,) on paths; their corners m, c, d are (r, 3, 3)."""
     points = loops().spline_points(corners, _nodes())
     found: FloatArray = lowest(machine.conditioning_at(points))
     return found
@@ -285,9 +290,9 @@ def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
 
 @kept
 def lowest(values: FloatArray) -> FloatArray:
-    """Return the smallest values (r,) of curve and line that pass through nodes (r, 7).
+    """Return the smallest values (r,) on curve and line, from the values (r, 7) at the nodes.
 
-    Between nodes they are the parabolas through each three in turn.
+    Between nodes, values are interpolated by parabolas through three successive nodes.
     """
     found = np.empty(len(values))
     for row in range(len(values)):
@@ -317,18 +322,19 @@ def solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Solve problems with linearised conditioning, by Hildreth's method.
 
-    Each constraint in turn is fulfilled, or relaxed as far as it has pushed.
+    For each constraint in turn, the point is pushed until the constraint holds with equality. It is
+    moved back at most as far as this constraint has pushed it before.
 
     Args:
         point: (r, 3) m, where the conditioning is linearised.
-        here: (r, 3), the same in units of the action.
+        here: (r, 3), ``point`` in units of the action.
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.
         lack: (r,) conditioning that is lacking at ``point``.
-        wanted: See :class:`Problem`, as for the others.
-        last: See there.
-        low: See there.
-        high: See there.
+        wanted: See :class:`Problem`.
+        last: See :class:`Problem`.
+        low: See :class:`Problem`.
+        high: See :class:`Problem`.
 
     Returns:
         Points (r, 3) m, and how far (r,) they are from ``point`` in units of the action.
@@ -369,6 +375,6 @@ def solved(
             there = point[row, i]
             for k in range(3):
                 there += rate[row, i, k] * move[k]
-            there = there if there == there else point[row, i]  # without an inverse or a Jacobian
+            there = there if there == there else point[row, i]  # NaN: no inverse, or no Jacobian
             found[row, i] = min(max(there, low[row, i]), high[row, i])
     return found, moved

@@ -49,11 +49,11 @@ class TPMEnv(gym.Env[Observation, Action]):
     | --- | --- | --- | --- | --- | --- |
     | Reach | 3 | 9 | 3 | 50 | bring P to the goal |
     | PickAndPlace | 4 | 21 | 3 | 50 | bring the block to the goal, on the table or above it |
-    | Push | 3 | 23 | 3 | 50 | shove the block to the goal |
+    | Push | 3 | 23 | 3 | 50 | push the block to the goal |
     | Stack | 4 | 33 | 6 | 100 | put the first block on the goal and the second on it |
-    | Throw | 4 | 21 | 3 | 60 | let the block go in flight; it slides to the goal |
+    | Throw | 4 | 21 | 3 | 60 | release the block in motion, so that it slides to the goal |
     | Conveyor | 4 | 22 | 3 | 80 | bring the block from the belt to the tray |
-    | Cycle | 3 | 9 | 3 | 75 | carry a payload 25 mm up, 305 mm across, 25 mm down, soon |
+    | Cycle | 3 | 9 | 3 | 75 | carry a payload 25 mm up, 305 mm across, 25 mm down, fast |
     | Crossing | 3 | 9 | 3 | 50 | pass the parallel singularity; Cartesian increments only |
 
     A control step takes 40 ms. Episodes are truncated, never terminated. The numbers below apply
@@ -77,9 +77,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     Commands accumulate and are projected into the task region; P follows them along a B-spline. The
     region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
-    turns of the joints move P far along y. Therefore the limit for P slows most random joint
-    actions down to a tenth, all three joints together. Cycle has control steps of 4 ms, smaller
-    increments and bounded accelerations.
+    turns of the joints move P far along y. Therefore the limit for P scales most random joint
+    actions down to a tenth, all three joints by one factor. Cycle has control steps of 4 ms,
+    smaller increments and bounded accelerations.
 
     ## Observation
 
@@ -98,14 +98,14 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_tilt | 2 | x and y of the object's axis |
     | object_held | 1 | share of the vacuum that holds the object, by a gauge |
 
-    Those of the object are repeated for each object. Push adds the object's turn about the
+    The entries of the object are repeated for each object. Push adds the object's turn about the
     vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,
     never from the simulated platform.
 
     With ``observations="pixels"`` the dictionary has a fourth entry: ``pixels``, (84, 84, 3) uint8,
-    a picture by the option ``camera``. ``observation`` keeps the entries of the robot, and those of
-    the object are left out. The goals stay vectors, as hindsight needs them. ``achieved_goal``
-    contains the position of the block. A policy for cameras alone must not use it.
+    a picture from the camera of the option ``camera``. ``observation`` then has only the entries of
+    the robot. The goals stay vectors, as hindsight needs them. ``achieved_goal`` contains the
+    position of the block; a policy for cameras alone must not use it.
 
     ## Reward
 
@@ -118,7 +118,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | goal, dense | minus the distance in units of 0.1 m; Cycle: more near the goal |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
-    | gate | minus the depth of P below the way over the gate, in units of 5 mm |
+    | gate | minus the depth of P below the gate, in units of 5 mm |
 
     SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
     alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` keeps the other terms; so does SB3's buffer
@@ -147,27 +147,28 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | after a reset with that option: the episode's plant |
 
-    Crossing adds ``crossed``: whether P is beyond y = 0, as the task asks. Push adds ``toppled``:
-    whether the block lies on a side.
+    Crossing adds ``crossed``: whether P is on the other side of y = 0 than home. Push adds
+    ``toppled``: whether the block lies on a side.
 
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 
     Past a parallel singularity the encoders no longer determine the platform's position. Then the
-    penalty is 1 and the episode is truncated. No action of the nominal robot with ideal drives
-    leads past one, except in Cycle: there, hostile actions at full speed can ask for more torque
+    penalty is 1 and the episode is truncated. With the nominal robot and ideal drives, no action
+    leads past one, except in Cycle: there, adversarial actions at full speed can need more torque
     than the motors have. ``shield=True`` prevents it.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
-            :func:`tpm_gym.register_task` knows), a :class:`~tpm_gym.tasks.Task` class, or a task,
-            which keeps its own machine, reward, goals and penalty weight.
+            :func:`tpm_gym.register_task` has registered), a :class:`~tpm_gym.tasks.Task` class, or
+            an instance, which keeps its own machine, reward, goals and penalty weight.
         control: ``"cartesian"`` or ``"joints"``.
         reward: ``"sparse"`` (None too) or ``"dense"``.
         engine: ``"pybullet"``, ``"analytic"``, ``"mujoco"`` (with the extra of that name), or a
-            name that :func:`tpm_gym.register_engine` knows. The analytic engine draws with
+            name that :func:`tpm_gym.register_engine` has registered. The analytic engine draws with
             PyBullet, or with MuJoCo where PyBullet is not installed.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
-            knows, or a :class:`~tpm_gym.Machine`; a spec that goes through JSON needs a name.
+            has registered, or a :class:`~tpm_gym.Machine`; a spec that is written as JSON needs a
+            name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
             the singularity, for machines whose goals are near one.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
@@ -284,15 +285,15 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Args:
             seed: Seeds the environment's rng; equal seeds give equal episodes.
-            options: Where objects (by name) start and the ``goal`` is, m, world frame, instead of
-                sampled ones.
+            options: Start positions of objects (by name) and the ``goal``, m, world frame. Others
+                are sampled.
 
         Raises:
-            ResetOptionError: If an option is unknown, no such array of finite numbers, or would put
-                an object into another or into the robot; nothing has happened then.
+            ResetOptionError: If an option is unknown, has the wrong shape, is not finite, or would
+                put an object into another or into the robot; nothing has happened then.
             UnreachableError: If an object or the goal is out of reach; nothing has happened then.
             EpisodeError: If the environment is closed.
-            ConfigurationError: If a method of the task does not return what it has to.
+            ConfigurationError: If a method of the task returns a wrong shape, type or value.
         """
         core, rng = self._core, None
         core.require_open()
@@ -364,7 +365,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed, or before the first reset.
-            ConfigurationError: If the engine has no such pictures.
+            ConfigurationError: If the engine cannot draw in this ``render_mode``.
         """
         if self.render_mode == "human":
             self._core.show()

@@ -35,7 +35,7 @@ from tpm_gym.tasks.task import Task
 
 __all__ = ["TPMVectorEnv"]
 
-_MOST = 10**6  # environments of pick-and-place; they take some 10 GB
+_MOST = 10**6  # largest number of environments; those of pick-and-place take some 10 GB
 
 Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
@@ -61,7 +61,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a full reset have different lengths, so that
             they do not all end at the same step. This makes on-policy batches more even.
-        render_mode: One of :class:`~tpm_gym.TPMEnv`'s, but not ``"human"``.
+        render_mode: See there, but not ``"human"``.
         options: Other options of :class:`~tpm_gym.TPMEnv`.
 
     Raises:
@@ -167,14 +167,14 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
         Args:
             seed: Seed of the first environment, increased by one for each further environment;
-                or a seed for each.
+                or n seeds, one for each environment.
             options: ``reset_mask``, (n,) booleans; and the options of :meth:`TPMEnv.reset`, used
                 for all environments.
 
         Raises:
             InputError: If a seed is not possible, or the number of seeds is not n; nothing has
                 happened then.
-            ResetOptionError: If the mask is not possible; also the errors of ``TPMEnv.reset``.
+            ResetOptionError: If the mask is not valid; also the errors of ``TPMEnv.reset``.
             EpisodeError: If the environments are closed.
         """
         self._require_open()
@@ -219,17 +219,16 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
         Raises:
             ActionError: If the actions have the wrong shape or are not finite.
-            EpisodeError: Before reset, after close, or where an episode ended and is not reset.
+            EpisodeError: Before reset, after close, or if an environment still has to be reset.
         """
         plain = type(actions) is np.ndarray and actions.dtype.char in "df"
         if not plain or actions.shape != self._shape or not np.isfinite(actions).all():
             actions = finite("actions", actions, self._shape, ActionError)
         self._require_running()
-        values = actions.astype(np.float64)
         if len(self._parts) == 1:
-            observation, reward, ended, info = self._parts[0].step(values)
+            observation, reward, ended, info = self._parts[0].step(actions)
         else:
-            found = self._each(lambda part, rows: part.step(values[rows]))
+            found = self._each(lambda part, rows: part.step(actions[rows]))
             observations, rewards, ends, infos = zip(*found, strict=True)
             observation, info = self._merged(zip(observations, infos, strict=True))
             reward, ended = np.concatenate(rewards), np.concatenate(ends)
@@ -295,7 +294,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the simulations and the threads."""
         del kwargs
-        # Gymnasium before 1.3 closes what a constructor that raised left behind, too.
+        # Gymnasium before 1.3 also closes an environment whose constructor raised, so that
+        # attributes may be missing.
         for part in getattr(self, "_parts", ()):
             part.core.close()
         if getattr(self, "_pool", None) is not None:
@@ -355,7 +355,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             The observation at that moment.
 
         Raises:
-            InputError: If they are no snapshots of equal environments; nothing has happened then.
+            InputError: If they are not snapshots of equal environments; nothing has happened then.
         """
         self._require_open()
         if not isinstance(snapshots, list) or len(snapshots) != len(self._parts):
@@ -413,12 +413,12 @@ class _Part:
         return infos
 
     def step(
-        self, actions: FloatArray
+        self, actions: NDArray[Any]
     ) -> tuple[Observation, FloatArray, BoolArray, dict[str, Any]]:
         """Run a control step, and reset environments whose episode ended."""
         core = self.core
         renewed = np.flatnonzero(self.ended)
-        core.step(actions, np.flatnonzero(~self.ended))
+        core.step(actions.astype(np.float64), np.flatnonzero(~self.ended))
         self.elapsed += 1
         infos = {}
         if len(renewed):
@@ -435,7 +435,7 @@ class _Part:
         return observation, reward, ended, infos
 
     def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
-        """Reset ended environments and replace their observations; return the infos of both."""
+        """Reset ended environments and replace their observations; return old and new infos."""
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
         for row in rows.tolist():
@@ -454,7 +454,7 @@ class _Part:
         }
 
     def require_equal(self, snapshot: Any) -> None:
-        """Raise InputError if it is no snapshot of an equal part of a vector environment."""
+        """Raise InputError unless it is a snapshot of an equal part of a vector environment."""
         self.core.require_equal(snapshot)
         if "elapsed" not in snapshot.columns:
             valid = "from save_state() of a vector environment, which counts steps"

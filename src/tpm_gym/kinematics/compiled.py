@@ -1,8 +1,8 @@
-"""The functions of a namespace, for floats in compiled code; see :mod:`tpm_gym.compiling`.
+"""Functions of a namespace, for floats in compiled code; see :mod:`tpm_gym.compiling`.
 
-The module itself is the namespace that compiled functions take. The functions have no branches and
-call no library, so that the compiler computes several rows at a time (SIMD), and so that results do
-not depend on a C library. They are accurate to two units in the last place, ``cos_third`` to four.
+Compiled functions get this module as their namespace ``ns``. The functions have no branches and
+call no library. So the compiler can compute several rows at a time (SIMD), and results do not
+depend on a C library. They are accurate to two units in the last place, ``cos_third`` to four.
 Their polynomials are minimax fits (Remez's exchange, in 60 digits). A test compares the functions
 with mpmath.
 
@@ -16,7 +16,7 @@ from tpm_gym.compiling import compilable
 from tpm_gym.kinematics import equations
 
 _TO_WHOLE: Final = 1.5 * 2.0**52  # adding and subtracting it rounds to a whole number
-_TURNS: Final = 2.0**20  # quarter turns up to which an angle can be reduced to a quarter
+_TURNS: Final = 2.0**20  # largest number of quarter turns in an angle; beyond it, results are NaN
 _TAN_EIGHTH: Final = math.sqrt(2.0) - 1.0
 # pi / 2 in parts of 33 bits, so that products with up to 2^20 are exact
 _HALF_PI: Final = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
@@ -46,12 +46,12 @@ _THIRD: Final = (
 
 
 def _six(c: tuple[float, ...], k: int, x: float) -> float:
-    """Evaluate a polynomial with six coefficients from c[k] on, without a loop for speed."""
+    """Evaluate c[k] + c[k + 1] x + ... + c[k + 5] x^5; there is no loop, for speed."""
     return c[k] + x * (c[k + 1] + x * (c[k + 2] + x * (c[k + 3] + x * (c[k + 4] + x * c[k + 5]))))
 
 
 def _sin_cos(x: float) -> tuple[float, float, float]:
-    """Return sine and cosine of x modulo a quarter turn, and the quarter turn of x, 0 to 3."""
+    """Return sin(r), cos(r) and k, 0 to 3, for x = r + k pi / 2 + full turns, |r| <= pi / 4."""
     whole = (x * (2.0 / math.pi) + _TO_WHOLE) - _TO_WHOLE
     whole = whole if abs(whole) <= _TURNS else math.nan
     r = ((x - whole * _HALF_PI[0]) - whole * _HALF_PI[1]) - whole * _HALF_PI[2]
@@ -62,14 +62,14 @@ def _sin_cos(x: float) -> tuple[float, float, float]:
 
 
 def cos(x: float) -> float:
-    """Compute the cosine; NaN beyond a million radians."""
+    """Compute the cosine; NaN if abs(x) is above 1.64 million radians."""
     sine, cosine, quarters = _sin_cos(x)
     value = sine if (quarters == 1.0) | (quarters == 3.0) else cosine
     return -value if (quarters == 1.0) | (quarters == 2.0) else value
 
 
 def sin(x: float) -> float:
-    """Compute the sine; NaN beyond a million radians."""
+    """Compute the sine; NaN if abs(x) is above 1.64 million radians."""
     sine, cosine, quarters = _sin_cos(x)
     value = cosine if (quarters == 1.0) | (quarters == 3.0) else sine
     return -value if quarters >= 2.0 else value
@@ -80,7 +80,7 @@ def arctan2(y: float, x: float) -> float:
     rise, run = abs(y), abs(x)
     steep = rise > run
     low, high = (run, rise) if steep else (rise, run)
-    bent = low > _TAN_EIGHTH * high  # then less an eighth of a turn
+    bent = low > _TAN_EIGHTH * high  # then ratio is the tangent of the angle minus pi / 4
     numerator, denominator = (low - high, low + high) if bent else (low, high)
     ratio = numerator / (denominator if denominator != 0.0 else 1.0)
     z = ratio * ratio
@@ -108,7 +108,7 @@ def clip(x: float) -> float:
 
 
 def cos_third(x: float) -> float:
-    """Compute the cosine of a third of the arccosine of the clipped number."""
+    """Compute cos(arccos(x) / 3), with x clipped to [-1, 1]."""
     s = math.sqrt(0.5 * (1.0 + clip(x)))
     s6 = (s * s * s) ** 2
     return 0.5 * (_six(_THIRD, 0, s) + s6 * (_six(_THIRD, 6, s) + s6 * _six(_THIRD, 12, s)))

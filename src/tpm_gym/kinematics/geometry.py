@@ -8,12 +8,12 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Share of l1 below which y_B1 counts as 0. The radii of the two circles then differ by less than
-1e-10 of l1, and their intersections would be inaccurate."""
+"""Share of l1 below which the least y_B1, l5 and |l5 - l1| count as 0. If y_B1 and another of them
+do, the circles of Eq. (6) can nearly coincide, and their intersections would be inaccurate."""
 
 
 class Lengths(NamedTuple):
-    """Lengths l1 to l7 as any kind of numbers, such as tensors; they are not checked."""
+    """Lengths l1 to l7, m, as any kind of numbers, such as tensors; they are not checked."""
 
     l1: Numbers
     l2: Numbers
@@ -61,8 +61,9 @@ class Geometry:
         l1, l5 = self.l1, self.l5
         close = _CLOSE * l1
         if self.l3 > l1 - close and min(l5, abs(l5 - l1)) < close:
-            # At a1 = b1 = 0 the two circles of Eq. (6) are concentric, and y_B1 is 2 l5 or
-            # 2 (l1 - l5). Where it is 0 they are one circle, and sub-chain I-II moves freely.
+            # Where a1 = b1 = 0 in Eq. (7), the two circles of Eq. (6) are concentric, and y_B1 is
+            # 2 l5 or 2 (l1 - l5). If y_B1 is 0 too, the circles coincide, and link 3' can move
+            # with motors 1 and 2 held.
             raise GeometryError(
                 "l5", l5, f"it must differ from 0 and from l1 = {l1} m by {close:.3g} m or more"
             )
@@ -91,7 +92,7 @@ PAPER = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=
 WIDE = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.600)
 """The paper's lengths with a longer l7, for a workspace of practical depth in y.
 
-Of l7 = 0.1, 0.2 ... 0.9 m, 0.6 m has the largest axis-aligned box, elbows out, in which the
-conditioning is at least 0.1 (:func:`tpm_gym.analysis.aspects.largest_box`): about 45 litres and
-0.3 m deep in y, against 3 litres and 0.02 m of PAPER.
+Values of l7 from 0.1 to 0.9 m in steps of 0.1 m were compared by their largest axis-aligned box
+with a conditioning of at least 0.1, elbows out (:func:`tpm_gym.analysis.aspects.largest_box`). The
+box is largest for 0.6 m: about 45 litres, 0.3 m deep in y. PAPER has 3 litres, 0.02 m deep.
 """

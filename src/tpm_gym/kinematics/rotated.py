@@ -1,17 +1,17 @@
 """The second operation mode: link 3' and the platform turned about y, in closed form.
 
-Seen along y, both rods of branch I are opposite sides of a four-bar linkage whose other two sides,
-links 3 and 3', are equal too. It is a parallelogram, in which link 3' only translates, as in the
-paper; or an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y, halves the
-angle between links 3 and 3'. Branch II lets link 3' turn about y, and branch III turns the platform
-with it.
+Seen along y, branch I is a four-bar linkage with opposite sides of equal length: rods 4a and 4b,
+and links 3 and 3'. In the paper's mode it is a parallelogram, in which link 3' only translates. In
+the second mode it is an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y,
+halves the angle between links 3 and 3'. Branch II lets link 3' turn about y, and branch III lets
+the platform turn with it.
 
-Both modes meet where z_C1 = z_B1, the constraint singularity: seen along y all four sides of the
-linkage then lie on one line, and it can leave that posture either way.
+Both modes meet at the constraint singularity, z_C1 = z_B1. There all four sides of the linkage,
+seen along y, lie on one line, and the linkage can move on in either mode.
 
-The paper's frame, m and rad; numpy arrays only. A tilt phi is a right-handed turn about y: link 3'
-points along (cos phi, 0, -sin phi). Seen along y, vectors are complex numbers x + i z here, so link
-3' is exp(-i phi).
+Everything is in the paper's frame, in m and rad, and in numpy arrays. The tilt phi is a
+right-handed turn about y: link 3' points along (cos phi, 0, -sin phi). A vector seen along y is
+written as a complex number x + i z, so the direction of link 3' is exp(-i phi).
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _Planar = NDArray[np.complex128]
 _Pair = tuple[FloatArray, FloatArray]
 _Four = tuple[FloatArray, FloatArray, FloatArray, FloatArray]  # two derivatives of two functions
 
-_NEAR = 1e-5  # largest distance from the unit circle at which an eigenvalue may be on it
-_MERGED = 1e-7  # fraction of l4; coinciding eigenvalues are accurate to half of the digits
-_STEPS = 4  # Newton steps, enough from half of the digits
-_FARTHEST = 0.01  # largest step that begins near a zero, rad or m
+_NEAR = 1e-5  # an eigenvalue this close to the unit circle may be on it
+_MERGED = 1e-7  # fraction of l4; where eigenvalues coincide, half of the digits are right
+_STEPS = 4  # Newton steps; enough if half of the digits are right
+_FARTHEST = 0.01  # largest Newton step that is taken, rad or m
 _CLOSED = 1e-13  # largest rounding error of a closure |rod|^2 - l4^2, in l4^2
 
 
@@ -92,7 +92,7 @@ class RotatedPostures:
         return self.ends - feet
 
     def _moved(self, offset: Sequence[FloatArray | float]) -> FloatArray:
-        """Displace C1 by an offset x, y, z (m) in the frame of link 3', to (..., 3) m."""
+        """Return C1 plus an offset (x, y, z), m, in the frame of link 3', as (..., 3) m."""
         x, y, z = offset
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
         along, up = x * cos + z * sin, z * cos - x * sin
@@ -105,8 +105,8 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
     """Compute the 8 assemblies with link 3' turned, for actuated angles theta (..., 3) rad.
 
     Link 3' depends on theta_1 and theta_2 alone and has 4 postures at most; link 7 has 2 for each.
-    The slots (..., 8) are in the order of :data:`.modes.ROTATED_MODES`. Where both modes meet
-    (phi = 0), the assembly is returned too. Entries that are not finite have no assembly.
+    The slots (..., 8) are in the order of :data:`.modes.ROTATED_MODES`. Assemblies in which both
+    operation modes meet (tilt 0) are included. Angles that are not finite have no assembly.
 
     Raises:
         InputError: If theta is no array (..., 3) of numbers.
@@ -131,8 +131,9 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Compute the postures (..., 48) with link 3' turned and P at position (..., 3) m.
 
-    Slots: cos(beta) < 0, then > 0; six tilts, in order; legs 2 and 3, each with
-    B_iC_i . dB_i/dtheta_i < 0, then > 0. Entries that are not finite have no posture.
+    Slots are ordered by the sign of cos(beta), then by the tilt (6, ascending), then by the sign of
+    B_iC_i . dB_i/dtheta_i of leg 2, then of leg 3; -1 comes before 1. Positions that are not finite
+    have no posture.
 
     Raises:
         InputError: If position is no array (..., 3) of numbers.
@@ -180,14 +181,15 @@ def _elbows(theta: FloatArray, g: Geometry) -> FloatArray:
 def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Find zeros (..., 2 d) of trigonometric polynomials of degree d, and whether they may be real.
 
-    The polynomials are given by their values (..., 2 d + 1) at equal steps from 0 through a turn.
-    The zeros are eigenvalues w = exp(i phi) of the companion matrix, in order of phi in (-pi, pi].
-    If phi is real, w is on the unit circle.
+    The polynomials are given by their values (..., 2 d + 1) at equally spaced angles in [0, 2 pi).
+    The zeros phi, ascending in (-pi, pi], are the angles of the eigenvalues w of the companion
+    matrix. A zero may be real if w is close to the unit circle.
     """
     degree = values.shape[-1] - 1
     coefficients = np.fft.fftshift(np.fft.fft(values), axes=-1)
     lower, highest = coefficients[..., :-1], coefficients[..., -1:]
-    least = 1e-14 * abs(lower).max(axis=-1, keepdims=True)  # where it is 0, w = 0 is another root
+    # If the highest coefficient is 0, so is the lowest. Then one w is 0, and another is very large.
+    least = 1e-14 * abs(lower).max(axis=-1, keepdims=True)
     companion = np.zeros((*values.shape[:-1], degree, degree), dtype=complex)
     companion[..., 1:, :-1] = np.eye(degree - 1)
     companion[..., -1] = -lower / np.where(abs(highest) < least, least, highest)
@@ -202,11 +204,13 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
     """Compute C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), each (..., 4).
 
-    Missing solutions are NaN. There is a slot for each pair of :data:`.modes.ROTATED_MODES`.
+    Missing solutions are NaN. There is a slot for each pair of signs (planar, further) of
+    :data:`.modes.ROTATED_MODES`.
 
-    Seen along y and from B1, C1 = rho n with n = exp(-i phi / 2), since B1C1 halves the angle. Then
-    the closures of rods 4a and 4b are equal, and the closure of rod 6 is linear in rho. Its square
-    is a trigonometric polynomial of degree 2, a quartic in tan(phi / 2).
+    Seen along y, the vector from B1 to C1 is rho n with n = exp(-i phi / 2), since it halves the
+    angle between links 3 and 3'. Then rods 4a and 4b have the same closure, which gives rho^2. With
+    this rho^2, the closure of rod 6 is 2 rho p = q. Its square, 4 rho^2 p^2 = q^2, is a
+    trigonometric polynomial of degree 2 in phi, a quartic in tan(phi / 2).
     """
     g = geometry
     b1, b2, _ = np.moveaxis(_elbows(theta, g), -2, 0)
@@ -214,14 +218,14 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
 
     def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return rho^2, and p and q of 2 rho p = q."""
+        """Return rho^2, p and q, where the closure of rod 6 is 2 rho p = q."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rho2 = reach2 - (2 * g.l5 * n.imag) ** 2
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
         return rho2, _dot(kappa, n), q
 
     def closures(rho: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
-        """Return the closures of rods 4 and of rod 6, m^2, and their slopes."""
+        """Return the closures of rods 4 and of rod 6, m^2, and the derivatives by rho and tilt."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
         gaps = rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2, abs(rod6) ** 2 - g.l4**2
@@ -234,7 +238,8 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     # Where p = q = 0, two neighbouring zeros coincide, and rho has both signs.
     rho = np.where(abs(p) < _MERGED * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
     (rho, tilt), gaps, slopes = _refined(closures, rho, tilt)
-    # Along the curve rho(phi) the closure of rod 6 changes its sign at every zero.
+    # The planar factor and the derivative of rod 6's closure along rho(phi) have this sign. It
+    # alternates from one zero to the next.
     a, b, c, d = slopes
     sign = (a * d - b * c) * rho
     real = near & (np.maximum(*map(abs, gaps)) < _CLOSED * g.l4**2)
@@ -243,11 +248,12 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 
 
 def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Solve theta_1 and tilt, (..., 6), for P and P - C1 in the frame of link 3', seen along y.
+    """Solve for theta_1 and tilt, (..., 6), given P, and P - C1 in the frame of link 3'.
 
-    B1C1 halves the angle where l3 sin(theta_1) equals ``up``, and the rods close where
-    l3 cos(theta_1) equals ``out``. The sum of both squares is l3^2. Times cos^2(phi / 2), that is a
-    trigonometric polynomial of degree 3.
+    Both vectors, ``p`` and ``link7``, are seen along y. For a tilt phi, ``terms`` returns the value
+    ``up`` of l3 sin(theta_1) for which B1C1 halves the angle between links 3 and 3', and the value
+    ``out`` of l3 cos(theta_1) for which rods 4 have their length. So up^2 + out^2 = l3^2 gives phi.
+    Multiplied by cos^2(phi / 2), this equation is a trigonometric polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 
@@ -287,18 +293,18 @@ def _refined(
     one: FloatArray,
     two: FloatArray,
 ) -> tuple[_Pair, _Pair, _Four]:
-    """Refine two unknowns of two closures by Newton's method; return unknowns, gaps and slopes."""
+    """Refine two unknowns by Newton's method; return them, the closures and their derivatives."""
     for _ in range(_STEPS):
         (e, f), (a, b, c, d) = closures(one, two)
         determinant = a * d - b * c
         first, second = (d * e - b * f) / determinant, (a * f - c * e) / determinant
-        small = abs(first) + abs(second) < _FARTHEST  # else there is no zero nearby
+        small = abs(first) + abs(second) < _FARTHEST  # else no zero is nearby
         one, two = one - np.where(small, first, 0.0), two - np.where(small, second, 0.0)
     return ((one, two), *closures(one, two))
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
-    """Sort solutions into slots: negative signs first, then by the tilt."""
+    """Sort solutions into slots: the half with the smaller ``sign`` first, then by the tilt."""
     real = ~np.isnan(sign)
     count = real.sum(axis=-1, keepdims=True)
     half = count // 2
@@ -333,9 +339,10 @@ def factors(postures: RotatedPostures) -> Factors:
     * level3 = l7 cos(beta) - B3C3 . u, m, with u along link 3'.
     * planar = B2C2 . dC2/dphi with motor 1 locked, m^2/rad, zero where the lines of rods 4a, 4b
       and 6, seen along y, meet in one point.
-    * leg1, m^2/rad, zero where motor 1 turns while P rests and link 3' turns about it.
+    * leg1, m^2/rad, zero where motor 1 can turn while P rests and link 3' turns about P.
     * leg2 and leg3 = B_iC_i . dB_i/dtheta_i, m^2/rad.
-    * elevation = z_C1 - z_B1 = -rho sin(phi / 2), m, zero where both modes meet.
+    * elevation = z_C1 - z_B1 = -rho sin(phi / 2), m, zero where both operation modes meet; see
+      :func:`link3_rotated`.
     """
     g = postures.geometry
     rods, rates = postures.rods, _elbow_rates(postures.theta, g)
@@ -360,18 +367,20 @@ def factors(postures: RotatedPostures) -> Factors:
 def velocity(postures: RotatedPostures) -> FloatArray:
     """Compute rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 4, 3).
 
-    Rods keep their lengths. So rods 4a, 4b and 6 give the twist of link 3', and rod 11 the rate of
-    link 7. At a parallel singularity, and where both modes meet, the rates are not finite.
+    The rates keep the lengths of all rods. Rods 4a, 4b and 6 give the velocity and the turn of link
+    3', and rod 11 gives the rate of link 7. At a parallel singularity, and where both operation
+    modes meet, the rates are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends
     rates = _elbow_rates(postures.theta, g)[..., [0, 0, 1, 2], :]
     pulls = np.sum(rods * rates, axis=-1)[..., None] * np.eye(3)[[0, 0, 1, 2]]
     c1, e_y = postures._moved([0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
-    # Rates of each rod for velocities of C1 along x and z, and for a turn about y through C1
+    # Rates of |rod|^2 / 2 for unit velocities of C1 along x and z, and a unit turn about y at C1
     turns = np.sum(rods * np.cross(e_y, ends - c1[..., None, :]), axis=-1)
     moved = np.stack([rods[..., 0], rods[..., 2], turns], axis=-1)
     cos, sin = np.cos(postures.beta), np.sin(postures.beta)
-    along7 = postures._moved([-g.l7 * sin, g.l7 * cos, 0.0]) - c1  # for a unit rate of link 7
+    # Velocity of P and C3 relative to link 3', for a unit rate of beta
+    along7 = postures._moved([-g.l7 * sin, g.l7 * cos, 0.0]) - c1
     to_p = np.cross(e_y, postures.position - c1)
     twist = _inverse(moved[..., :3, :]) @ pulls[..., :3, :]
     wanted = pulls[..., 3, :] - np.einsum("...i,...ij->...j", moved[..., 3, :], twist)

@@ -75,10 +75,10 @@ def reachable(
 def assembly_of(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> IntArray:
-    """Find the slot in ASSEMBLY_MODES of the posture of ``branch`` at points (..., 3).
+    """Return the index in ASSEMBLY_MODES of the assembly mode at points (..., 3) on ``branch``.
 
     Returns:
-        (...,) slot, or -1 where the point is not reachable on ``branch``.
+        (...,) index, or -1 where the point is not reachable on ``branch``.
     """
     sin_beta, _, planar, *_ = factors_at(position, branch, geometry)
     slots = 2 * (planar > 0) + 1 * (sin_beta > 0)

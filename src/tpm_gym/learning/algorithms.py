@@ -1,7 +1,7 @@
 """Algorithms of Stable-Baselines3: a row of the table for each, and the entries of its recipes.
 
 A row of ``ALGORITHMS`` and a file ``train/recipes/<name>.yml`` are enough to train, resume,
-evaluate and export with another algorithm. An argument that no algorithm had before is a row of
+evaluate and export with another algorithm. An argument that no earlier algorithm has needs a row in
 ``_ENTRIES``.
 """
 
@@ -101,7 +101,7 @@ class Algorithm:
         return given.get(name, parameters[name].default if name in parameters else None)
 
     def entries(self) -> Any:
-        """Return the type of a recipe: the entries above that the constructors take."""
+        """Return the type of a recipe: entries that algorithm and policy have as arguments."""
         kind: Any = self.load_class()
         arguments = inspect.signature(kind).parameters
         policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters

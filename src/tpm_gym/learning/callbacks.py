@@ -22,15 +22,15 @@ from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.training_state import capture
 
 _SHORTEST_INTERVAL: Final = 30.0  # s between checkpoints
-_LARGEST_SHARE: Final = 0.02  # of the time may go into checkpoints
+_LARGEST_SHARE: Final = 0.02  # largest fraction of the time for writing checkpoints
 
 
 @dataclass(eq=False)
 class PeriodicEvaluation(BaseCallback):
     """Evaluation of the policy on held-out seeds before, during and after training.
 
-    All evaluations use the same episodes. Each is appended to evaluations.jsonl, with the time of
-    the training until then: that of a clock, and that of the CPU in this process.
+    All evaluations use the same episodes. Each is appended to evaluations.jsonl with the training
+    time so far, s: wall-clock time, and CPU time of the main process (without workers).
 
     ``envs`` are separate, so that evaluations do not disturb training. ``keep`` is called with the
     model whenever it is the best so far.
@@ -57,7 +57,7 @@ class PeriodicEvaluation(BaseCallback):
 
     def _on_step(self) -> bool:
         due = self.num_timesteps - self.evaluations[-1]["steps"] >= self.config.eval_every
-        # The last evaluation waits for the last update, since that policy is saved.
+        # The last evaluation follows the last update, so that it tests the policy that is saved.
         if due and self.num_timesteps < self.config.steps:
             self._evaluate()
         return True
@@ -68,9 +68,9 @@ class PeriodicEvaluation(BaseCallback):
     def _evaluate(self) -> None:
         policy, episodes = TrainedPolicy(self.model), self.config.eval_episodes
         metrics = summarise(run_episodes(self.envs, policy, episodes, SELECTION_SEED))
-        earlier = max(map(_quality, self.evaluations), default=None)
+        earlier = max(map(quality, self.evaluations), default=None)
         self._record({name: estimate.as_dict() for name, estimate in metrics.items()})
-        best = earlier is None or _quality(self.evaluations[-1]) > earlier
+        best = earlier is None or quality(self.evaluations[-1]) > earlier
         if best:
             self.keep(self.model)
         success = metrics["success_at_end"]
@@ -99,7 +99,8 @@ class PeriodicEvaluation(BaseCallback):
         self.logger.dump(self.num_timesteps)
 
 
-def _quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
+def quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the pair (success, return) of an evaluation; the best policy has the largest pair."""
     return evaluation["success_at_end"]["mean"], evaluation["return"]["mean"]
 
 
@@ -135,9 +136,9 @@ class StopTrainingError(Exception):
 class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
-    A checkpoint that cannot be written is reported and tried again when the next one is due. The
-    first is saved before training, so that each policy has a checkpoint. ``seconds`` is the time of
-    the training in earlier processes.
+    A checkpoint that cannot be written is reported, and tried again when the next one is due. The
+    first one is saved before training, so that each policy has a checkpoint. ``seconds`` is the
+    training time in earlier processes, s.
     """
 
     config: TrainingConfig
@@ -176,7 +177,7 @@ class Checkpointing(BaseCallback):
         return time.perf_counter() >= self._next_time
 
     def save(self, finished: bool = False) -> None:
-        """Save a checkpoint, or report why not."""
+        """Save a checkpoint; report an error instead of raising it."""
         started = time.perf_counter()
         content = capture(self.model, self.config.run, seconds_trained(self.model), finished)
         try:

@@ -1,8 +1,8 @@
 """Checkpoints on disk, each in one file, written atomically and with a checksum.
 
-A checkpoint is ``checkpoints/<step>.checkpoint``: a NumPy archive after its SHA-256. The file is
-written under another name, flushed to the disk and renamed, so a kill leaves the earlier
-checkpoints untouched. Nothing is unpickled. Small files (JSON, and tensors for
+A checkpoint is the file ``checkpoints/<step>.checkpoint``: the SHA-256 of a NumPy archive, then the
+archive. The file is written under another name, flushed to the disk and renamed, so a kill leaves
+earlier checkpoints untouched. Nothing is unpickled. Small files (JSON, and tensors for
 ``torch.load(weights_only=True)``) are stored as arrays of bytes.
 """
 
@@ -113,20 +113,20 @@ class CheckpointStore:
         return sorted(int(match[1]) for match in found if match and not match[2])
 
     def _tidy(self) -> None:
-        """Delete earlier checkpoints, and parts that a killed process left."""
+        """Delete earlier checkpoints, and partial files that a killed process left."""
         kept = {self.path(step).name for step in self._whole}
         for entry in self.folder.iterdir():
             if _NAME.fullmatch(entry.name) and entry.name not in kept:
-                with suppress(OSError):  # deleted after the next checkpoint, if it is a file
+                with suppress(OSError):  # tried again after the next checkpoint
                     entry.unlink()
 
 
 def _write(path: Path, content: Content) -> None:
-    """Write a checkpoint, and wait until the disk has it."""
+    """Write a checkpoint and flush it to the disk."""
     entries: dict[str, Any] = {"head": np.array([FORMAT, content.step, content.finished])}
     entries |= {f"files/{k}": np.frombuffer(data, np.uint8) for k, data in content.files.items()}
     entries |= {f"arrays/{name}": array for name, array in content.arrays.items()}
-    # Compression would take ten times as long and save little of random motion.
+    # Compression would take ten times as long, and data of random motion would hardly shrink.
     archive = io.BytesIO()
     np.savez(archive, allow_pickle=False, **entries)
     with path.open("wb") as file:
@@ -156,7 +156,7 @@ def starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArr
 
 
 def _flush_folder(folder: Path) -> None:
-    """Wait until the disk has the names in a folder; Windows has no such call."""
+    """Flush the names in a folder to the disk; do nothing on Windows, which has no such call."""
     if os.name == "posix":
         handle = os.open(folder, os.O_RDONLY)
         try:

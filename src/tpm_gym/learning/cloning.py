@@ -14,8 +14,8 @@ _BATCH: Final = 256
 _BETA: Final = 0.1
 """Error of an action at which the loss becomes linear.
 
-Where the expert acts in two ways in one state, as at a turn of its way, a squared loss would teach
-the mean of both, which does neither.
+In similar states, for example where its path turns, the expert takes two different actions. A
+squared loss would teach their mean, which is neither of them.
 """
 _VALUE_EPOCHS: Final = 3
 

@@ -20,7 +20,7 @@ from tpm_gym.viewer import ViewConfig, run
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Write a trained policy as safetensors and JSON, which load without trust."""
+    """Write a trained policy as safetensors and JSON. Loading these files runs no code."""
 
     model: Annotated[Positional[Path], tyro.conf.arg(metavar="MODEL")]
     """best.zip or last.zip in the folder of a run, or an exported policy (.json)."""

@@ -8,11 +8,18 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 from pydantic import ConfigDict, TypeAdapter, ValidationError
+from tyro.constructors import PrimitiveConstructorSpec
 
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.environments import check_env_id, import_module_of
 from tpm_gym.learning.errors import ConfigError, RunError
-from tpm_gym.learning.recipes import Recipe, check_recipes, read_recipe, recipe_file
+from tpm_gym.learning.recipes import (
+    Recipe,
+    algorithm_for,
+    check_recipes,
+    read_recipe,
+    recipe_file,
+)
 from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
 from tpm_gym.learning.run_folder import CONFIG_FILE
 
@@ -51,6 +58,22 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
     return found
 
 
+def parse_shield(words: Sequence[str]) -> bool | float:
+    """Parse the words after ``--shield``: ``True`` or none, ``False``, or a conditioning."""
+    text = " ".join(words) or "True"
+    return text == "True" if text in ("True", "False") else float(text)
+
+
+_SHIELD: Final = PrimitiveConstructorSpec[Any](
+    nargs="*",
+    metavar="[True|False|CONDITIONING]",
+    instance_from_str=parse_shield,
+    is_instance=lambda value: value is UNSET or isinstance(value, bool | float),
+    str_from_instance=lambda value: [str(value)],
+)
+_SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluate: the policy's)")
+
+
 @dataclass(frozen=True)
 class EnvOptions:
     """Options of an environment; an option that is not given keeps the id's value."""
@@ -69,7 +92,7 @@ class EnvOptions:
     ] = UNSET
     """Motors: ideal ones follow commands exactly up to their peak torque; servo drives lag."""
 
-    shield: bool = False
+    shield: Annotated[bool | float | None, _SHIELD, _SHIELD_HINT] = UNSET
     """Replace actions by the nearest ones that keep clear of singularities."""
 
     @property
@@ -79,14 +102,22 @@ class EnvOptions:
 
     def given(self) -> dict[str, Any]:
         """Return the options that are given, as arguments of an environment."""
-        return {name: value for name, value in vars(self).items() if value not in (UNSET, False)}
+        return {name: value for name, value in vars(self).items() if value is not UNSET}
+
+
+GivenEnvOptions = Annotated[
+    tyro.conf.OmitArgPrefixes[EnvOptions], tyro.conf.arg(name="environment")
+]
+"""Options of an environment in a group of their own in the help."""
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
     """Train a policy. Everything about the run goes to one folder."""
 
-    algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "sac"
+    algo: Annotated[
+        str, unset(str, "one that has a recipe for <env>", "{" + ",".join(ALGORITHMS) + "}")
+    ] = UNSET
     """Algorithm: sac and tqc for sparse rewards, ppo for a Dense id."""
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReach-v0"
@@ -108,7 +139,8 @@ class TrainingConfig:
     """Hyperparameters in that file."""
 
     demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
-    """Episodes of the expert that are taught at the start; 0 for none."""
+    """Episodes of the expert that are taught at the start, rounded up to a multiple of <envs>; 0
+    for none."""
 
     run: Annotated[Path, unset(Path, "runs/<env>-<algo>-s<seed>", "FOLDER")] = UNSET
     """Folder of the run."""
@@ -119,7 +151,7 @@ class TrainingConfig:
     goals: Literal["sampled", "tempting"] = "sampled"
     """Goals: sampled everywhere, or only next to the singularity (tempting)."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
@@ -133,7 +165,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the last test, in PyBullet, of a policy from --engine analytic; 0 for none."""
+    """Episodes in each engine of the last test, which follows a training in --engine analytic; 0
+    for none."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By time: every 30 s, for at most 2% of the time."""
@@ -158,7 +191,7 @@ class TrainingConfig:
 
     @property
     def horizon(self) -> int:
-        """Number of steps after which an episode is truncated, over all environments."""
+        """Number of steps of one full episode, over all environments."""
         return self.envs * (check_env_id(self.env).max_episode_steps or 0)
 
     @property
@@ -226,8 +259,11 @@ def complete(config: TrainingConfig) -> TrainingConfig:
     import_module_of(config.env)
     check_env_id(config.env)
     _check_numbers(config)
-    many = config.env_options.in_batches
-    shipped = recipe_file(config.algo, config.env_options.engine)
+    many, engine = config.env_options.in_batches, config.env_options.engine
+    if config.algo is UNSET:
+        found = algorithm_for(config.env, engine, config.recipe_file)
+        config = replace(config, algo=found)
+    shipped = recipe_file(config.algo, engine)
     file = shipped if config.recipe_file is UNSET else config.recipe_file
     recipe = read_recipe(file, config.algo, config.env)
     if (count := config.demonstrations) is not UNSET:
@@ -243,6 +279,8 @@ def complete(config: TrainingConfig) -> TrainingConfig:
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)
+    played = -(-int(recipe.demonstrations.get("episodes", 0)) // config.envs) * config.envs
+    config = replace(config, demonstrations=played)
     if config.eval_every is UNSET:  # between updates the policy does not change
         often = max(config.rollout, config.steps // (20 if many else 10))
         config = replace(config, eval_every=often)
@@ -281,7 +319,7 @@ def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
         found = kind.validate_json(text)[CONFIG_FILE]
         recipe_file(found.algo)  # refuses an unknown algorithm
         check_recipes(CONFIG_FILE, {"recipe": found.recipe.entries()}, found.algo)
-    except (ValidationError, AttributeError, ConfigError) as error:  # a recipe of null
+    except (ValidationError, AttributeError, ConfigError) as error:  # AttributeError: recipe: null
         problem = " ".join(str(error).split())
         raise RunError(
             f"the configuration of {run} is damaged: {problem}; start the run anew with tpm-gym "
@@ -349,12 +387,14 @@ def _check_recipe(config: TrainingConfig) -> None:
             f"{where}: {min(sizes, key=sizes.__getitem__)}: 1: advantages of one step cannot be "
             "normalised; raise it, or set normalize_advantage: false",
         )
-    if config.recipe.hindsight:  # it draws from whole episodes
+    if config.recipe.hindsight:  # hindsight samples from whole episodes only
         for name in ("learning_starts", "buffer_size"):
+            few, most = config.argument(name), config.argument(name) * envs // config.horizon
+            fewer = f", or give at most --envs {most}" if most else ""
             _refuse(
-                config.argument(name) < config.horizon,
-                f"{where}: {name}: {config.argument(name)} is less than the {config.horizon} steps "
-                f"of an episode in each of {envs} environments; raise it, or use fewer --envs",
+                few < config.horizon,
+                f"{where}: {name}: {few} is less than the {config.horizon} steps of an episode in "
+                f"each of {envs} environments; raise it in a --recipe of yours{fewer}",
             )
 
 
@@ -363,7 +403,7 @@ def _check_device(device: str) -> None:
     import torch
 
     try:
-        torch.zeros(1, device=device).item()  # the device meta holds no numbers
+        torch.zeros(1, device=device).item()  # fails on the device meta, which stores no numbers
     except (RuntimeError, AssertionError) as error:  # AssertionError: PyTorch without CUDA
         problem = str(error).partition("\n")[0]
         raise ConfigError(f"--device {device}: {problem}; try cpu") from error

@@ -1,15 +1,14 @@
 """Datasets for offline learning, in the format of Minari.
 
-The episodes of ``expert``, ``noisy`` and ``random`` depend on their seeds alone: the command that
-made a dataset makes it again, equal in every bit, and the first episodes of a long dataset are
-those of a short one. ``replay`` depends on the training, too; see :mod:`tpm_gym.learning.replay`.
+The episodes of ``expert``, ``noisy`` and ``random`` depend on their seeds alone. Repeating a
+command therefore gives a bit-equal dataset, and a longer dataset begins with the episodes of a
+shorter one. ``replay`` depends on the training, too; see :mod:`tpm_gym.learning.replay`.
 """
 
 from __future__ import annotations
 
 import copy
 import hashlib
-import importlib.util
 import json
 import math
 import tempfile
@@ -27,9 +26,14 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 import tpm_gym
-from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning import provenance
-from tpm_gym.learning.configuration import UNSET, EnvOptions, check_least, unset
+from tpm_gym.learning.configuration import (
+    UNSET,
+    EnvOptions,
+    GivenEnvOptions,
+    check_least,
+    unset,
+)
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.evaluation import bar
@@ -68,8 +72,8 @@ _OURS: Final = "tpm_gym"  # entry of the metadata that marks our datasets
 class CollectConfig:
     """Collect datasets for offline learning, in the format of Minari.
 
-    The kinds are: the expert's episodes; those of the expert with noise on its actions; uniform
-    random actions; and "replay", the episodes of a policy at ten moments of its training.
+    The kinds are: "expert"; "noisy", the expert with noise on its actions; "random", uniform random
+    actions; and "replay", a policy at ten moments of its training.
     """
 
     env: Annotated[tuple[str, ...], unset(tuple[str, ...], "all with an expert", "ID ...")] = UNSET
@@ -82,13 +86,13 @@ class CollectConfig:
     """Episodes of each dataset."""
 
     seed: int = 0
-    """Seed of the first episode, and of the training of replay."""
+    """Seed of the first episode, and of the training of kind replay."""
 
     noise: float = 0.3
-    """Standard deviation of the noise of noisy, in units of the largest action."""
+    """Standard deviation of the noise of kind noisy, in units of the largest action."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Steps of the training of replay."""
+    """Steps of the training of kind replay."""
 
     out: Annotated[Path, unset(Path, "Minari's", "FOLDER")] = UNSET
     """Folder of the datasets. Minari's is $MINARI_DATASETS_PATH, or ~/.minari/datasets."""
@@ -96,9 +100,7 @@ class CollectConfig:
     overwrite: bool = False
     """Replace datasets of this command that are there already."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(
-        default_factory=lambda: EnvOptions(engine="analytic")
-    )
+    env_options: GivenEnvOptions = field(default_factory=lambda: EnvOptions(engine="analytic"))
 
 
 @dataclass(frozen=True)
@@ -117,13 +119,17 @@ class Dataset:
         given = {"engine": own, **self.config.env_options.given()}
         if given["engine"] == "analytic":  # the command's default
             del given["engine"]
+        if given.get("shield") is False:  # the id's default
+            del given["shield"]
+        if given.get("shield", True) is not True:
+            given["shield"] = f"shield{given['shield']}".replace(".", "_")  # Minari has no dots
         options = [value if isinstance(value, str) else key for key, value in given.items()]
         words = "-".join(filter(None, (self.kind, *options)))
         return f"{self.env.rpartition(':')[2]}/{words}-v0"
 
     @property
     def folder(self) -> Path:
-        """Folder, whose ``data`` Minari loads."""
+        """Folder of the dataset; Minari loads its subfolder ``data``."""
         return self.root / self.name
 
 
@@ -159,9 +165,7 @@ def _require_packages(kinds: Sequence[str]) -> None:
     extras = {"minari": "data", "h5py": "data"}
     if "replay" in kinds:
         extras |= {"torch": "train", "stable_baselines3": "train"}
-    for package, extra in extras.items():
-        if importlib.util.find_spec(package) is None:
-            raise MissingPackageError(package, extra)
+    provenance.require_packages(extras)
 
 
 def _complete(config: CollectConfig) -> list[str]:
@@ -236,7 +240,10 @@ def _record(
 
 
 def _split(steps: Sequence[Step], first_seed: int, count: int) -> Iterator[EpisodeBuffer]:
-    """Yield the episodes of the first ``count`` rows; observations and infos have one more row."""
+    """Yield the episodes of the first ``count`` rows.
+
+    Observations and infos have one entry more than actions: the entry after the last step.
+    """
     from minari.data_collector import EpisodeBuffer
 
     last = steps[-1]
@@ -300,7 +307,7 @@ def _write(dataset: Dataset, scores: tuple[float, float], console: Console) -> s
         storage.update_metadata(_metadata(dataset, scores, found))
         there = dataset.folder / _DATA
         there.mkdir(parents=True, exist_ok=True)
-        for file in data.iterdir():  # beside them may be files that are not ours
+        for file in data.iterdir():  # one by one: the folder may hold files that are not ours
             file.replace(there / file.name)
     return found
 

@@ -1,10 +1,11 @@
-"""Episodes of the scripted expert, from which a training starts.
+"""Episodes of the scripted expert from which an algorithm learns before it acts itself.
 
-An algorithm with a replay buffer gets them there: so pick-and-place learns from a sparse reward
-within minutes (Nair et al. 2018). They are stored as whole episodes, so that hindsight can relabel
-them. An on-policy algorithm such as PPO gets its networks fitted to them (behaviour cloning), and
-improves what it got (Rajeswaran et al. 2018). In both cases they count as environment steps, so
-that no learning curve hides them.
+For an algorithm with a replay buffer, the episodes are added to the buffer (Nair et al. 2018). With
+them, SAC and TQC learn pick-and-place from a sparse reward within minutes. Episodes are stored
+whole, so that hindsight can relabel them. For an on-policy algorithm such as PPO, networks are
+fitted to the episodes first (behaviour cloning), and training continues from there (Rajeswaran et
+al. 2018). In both cases the episodes count as environment steps, so that learning curves include
+them.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,7 @@ _OTHER: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagger", 
 
 
 class _Step(NamedTuple):
-    """A control step of n environments: ``actions`` are those of the expert and the noise."""
+    """Control step of n environments: ``actions`` are the expert's ``wanted`` plus noise."""
 
     seen: Observation
     wanted: Action
@@ -38,7 +39,7 @@ class _Step(NamedTuple):
 
 
 class Demonstrations(BaseCallback):
-    """Callback that plays the expert's episodes when training starts, and teaches them.
+    """Callback that plays the expert's episodes and trains on them when training starts.
 
     Every second episode has normally distributed noise on the motion, so that the policy learns in
     states that the expert never reaches by itself; some of these episodes fail. A replay buffer
@@ -56,7 +57,7 @@ class Demonstrations(BaseCallback):
         Args:
             episodes: Rounded up to a multiple of the number of environments.
             noise: Standard deviation, in units of the largest action.
-            epochs: Passes over the episodes, where the networks are fitted to them.
+            epochs: Passes over the episodes when an on-policy algorithm is fitted to them.
         """
         super().__init__(verbose)
         self.episodes, self.noise, self.epochs = episodes, noise, epochs
@@ -65,7 +66,7 @@ class Demonstrations(BaseCallback):
     def _on_training_start(self) -> None:
         model = self.model
         if model.num_timesteps > 0:
-            return  # a resumed run has them already
+            return  # a resumed run has already used the episodes
         if isinstance(model, OnPolicyAlgorithm):
             self._clone(model)
         elif isinstance(model, OffPolicyAlgorithm) and model.replay_buffer is not None:
@@ -93,7 +94,7 @@ class Demonstrations(BaseCallback):
         clone(model, seen, wanted, returns, self.epochs)
 
     def _play(self) -> Iterator[_Step]:
-        """Play all episodes, each environment one after the other."""
+        """Play all episodes: one in each environment at a time."""
         model = self.model
         count, spec = self.training_env.num_envs, self.training_env.get_attr("spec")[0]
         options = {name: own for name, own in spec.kwargs.items() if name not in _OTHER}
@@ -124,7 +125,7 @@ class Demonstrations(BaseCallback):
 def _returns(steps: Sequence[_Step], gamma: float) -> list[NDArray[Any]]:
     """Return the discounted sum of rewards (n,) from each step on.
 
-    The last reward of an episode is taken to go on for ever, since episodes end by time alone.
+    The last reward of an episode is assumed to continue for ever, since only a time limit ends it.
     """
     found: list[NDArray[Any]] = []
     total = np.zeros(0)

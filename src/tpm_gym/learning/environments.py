@@ -20,8 +20,8 @@ from tpm_gym.learning.rollout import GoalEnv
 def import_module_of(env_id: str) -> None:
     """Import the module of an id ``module:id`` that the user has typed; do nothing for other ids.
 
-    The module may be a file of the working folder. Ids from files must not come here: a module runs
-    any code when it is imported.
+    The module may be a file of the working folder. Do not call this function with an id that was
+    read from a file: importing a module runs its code.
     """
     module = env_id.rpartition(":")[0]
     if not module:
@@ -50,6 +50,9 @@ def check_env_id(env_id: str) -> EnvSpec:
         spec = gym.spec(name if module else env_id)
     except (gym.error.Error, ValueError) as error:  # ValueError: ":" with no module before it
         there = f"there are {', '.join(env_ids())}, and module:id for those that a module registers"
+        if module:
+            file = getattr(sys.modules[module], "__file__", None) or "a part of Python"
+            there = f"the module is {file}; if you mean another file, give it another name"
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
     entry: Any = spec.entry_point
     if isinstance(entry, str):
@@ -65,8 +68,8 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
 
     Args:
         env: An id, or its registration, which another process may not have.
-        in_worker: Whether this is a worker process. A terminal signals all processes, and a worker
-            must outlive the signal until the main process has saved.
+        in_worker: Whether this is a worker process. Ctrl-C reaches all processes of a terminal. A
+            worker ignores it, so that the main process can still save.
     """
     if in_worker:
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -19,6 +19,7 @@ from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import (
     UNSET,
     EnvOptions,
+    GivenEnvOptions,
     Randomised,
     check_least,
     parse_randomisation,
@@ -63,7 +64,7 @@ class EvaluationConfig:
     """Episodes of each policy."""
 
     seed: int = TEST_SEED
-    """Seed of the first episode. Training and selection use smaller ones than the default."""
+    """Seed of the first episode. Training and selection use seeds below the default."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
     """Goals: sampled everywhere, or only next to the singularity (tempting)."""
@@ -71,7 +72,7 @@ class EvaluationConfig:
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
@@ -86,7 +87,7 @@ class EvaluationConfig:
     """Episodes of the video."""
 
     picture: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
-    """PNG of six moments of the first episode; several policies get a file each."""
+    """PNG of six different moments of the first episode; several policies get a file each."""
 
     camera: Literal["table", "overview", "cup"] = "table"
     """Camera of video and picture: the task region, the whole robot, or close to the cup."""
@@ -133,7 +134,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     config = _complete(config)
     count = min(config.episodes, BATCH) if config.env_options.in_batches else 1
     with closing(_make_envs(config, count)) as envs:
-        # All are loaded before the first one runs, so that a mistyped name shows at once.
+        # All policies are loaded before the first one runs, so that a mistyped name fails at once.
         policies = list(zip(config.policy, _load(config, envs), strict=True))
         results = [_evaluate_one(envs, *policy, config, console) for policy in policies]
     console.print(_table(config, results))
@@ -183,15 +184,19 @@ def _common(option: str, values: Mapping[str, Any]) -> Any:
     found = set(values.values())
     if len(found) > 1:
         each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
-        raise ConfigError(f"policies differ in {option}: {each}; choose one with --{option}")
+        example = f"--{option} {next(iter(values.values()))}"
+        raise ConfigError(f"policies differ in {option}: {each}; choose one, as in {example}")
     return found.pop()
 
 
 def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of machine, engine and drive, by default the id's, and a shield, if any."""
+    """Return the names of machine, engine and drive, and the shield if one is given.
+
+    A name that is not given is the id's.
+    """
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     if given.get("shield"):
-        usual["shield"] = "True"
+        usual["shield"] = ""
     own = check_env_id(env_id).kwargs
     found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
     return {name: str(getattr(value, "name", value)) for name, value in found.items()}
@@ -284,22 +289,22 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 
 def _film(config: EvaluationConfig, console: Console) -> None:
-    """Repeat the first episodes with rendering, so that it does not slow the evaluation."""
+    """Repeat the first episodes with rendering, which would slow the evaluation itself."""
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
         policies = _load(config, envs)
-        write_film = partial(write_video, fps=envs.metadata["render_fps"])
+        fps = envs.metadata["render_fps"]
         films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
-            ("video", config.video, count, write_film),
-            ("picture", config.picture, 1, write_contact_sheet),
+            ("video", config.video, count, partial(write_video, fps=fps)),
+            ("picture", config.picture, 1, partial(write_contact_sheet, fps=fps)),
         )
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
-                console.print(f"{kind}: {path}, {episodes * frames} frames ...", markup=False)
                 with bar(console, kind, episodes * frames) as advance:
                     write(path, partial(_play, envs, policy, episodes, config.seed, advance))
+                console.print(f"{kind}: {path}", markup=False)
 
 
 def _play(

@@ -1,4 +1,4 @@
-"""Export of a trained policy as safetensors and JSON, which load without trust."""
+"""Export of a trained policy as safetensors and JSON. Loading these files runs no code."""
 
 import io
 import os
@@ -28,10 +28,10 @@ from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-4
-"""Largest error of an exported action, in units of half its range if that is above 1.
+"""Largest error of an exported action, relative to half its range or to 1, whichever is larger.
 
-Single precision rounds the actions of networks with large weights by 1e-5. A file with other
-weights or another activation is off by far more.
+Single precision rounds the actions of networks with large weights by 1e-5. Wrong weights or a wrong
+activation cause far larger errors.
 """
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
@@ -49,8 +49,8 @@ def save(
 ) -> Path:
     """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
 
-    The written policy must act like the model before the files get their names. A policy that the
-    files cannot express is therefore refused, not changed.
+    The files get their final names only after a check that the written policy acts like the model.
+    A policy that the files cannot express is therefore refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
@@ -93,14 +93,14 @@ def save(
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model as Stable-Baselines3 does, but so that readers never see a part of the file."""
-    file = io.BytesIO()  # writing to a full disk, PyTorch would hide the reason
+    """Save a model as an archive of Stable-Baselines3; readers never see a part of the file."""
+    file = io.BytesIO()  # PyTorch itself, writing to a full disk, would hide the error
     model.save(file)
     provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))
 
 
 def remove(path: Path) -> None:
-    """Delete the files that :func:`save` wrote as ``path``, if it did."""
+    """Delete the files that :func:`save` wrote as ``path``; leave files that are no policy."""
     json_file, weights_file = files(path)
     if _is_policy(json_file):
         weights_file.unlink(missing_ok=True)
@@ -191,7 +191,7 @@ def load_model(archive: Path, algorithm: str) -> BaseAlgorithm:
 def _network(
     model: BaseAlgorithm, actor: Actor
 ) -> tuple[dict[str, Any], dict[str, NDArray[np.float32]]]:
-    """Return the description and the weights of the layers of the mean action."""
+    """Return the description and the weights of the layers that compute the mean action."""
     if getattr(model, "use_sde", False):
         raise PolicyError("state-dependent exploration (use_sde)")
     if model.get_vec_normalize_env() is not None:
@@ -248,7 +248,7 @@ def _write(path: Path, content: Mapping[str, Any], data: bytes, model: BaseAlgor
         provenance.write_json(new_json, content)
         new_weights.write_bytes(data)
         _verify(model, new_json)
-        # Between the two renames, the sums show a reader that the files do not belong together.
+        # Between the two renames, a reader sees from the checksums that the files do not match.
         # After a kill there, the JSON file allows the next export to replace both.
         new_json.replace(json_file)
         new_weights.replace(weights_file)
@@ -261,14 +261,14 @@ def _verify(model: BaseAlgorithm, written: Path) -> None:
     boxes: Any = model.observation_space
     space: Any = model.action_space
     shapes = {key: (_TRIALS, *box.shape) for key, box in boxes.items()}
-    # Observations are below 1 m, and few are above 1 m/s. Larger ones would only enlarge what NumPy
-    # and PyTorch round differently, up to the tolerance for the large weights of a long training.
+    # Observations are below 1 m, and few are above 1 m/s. With larger ones, and the large weights
+    # of a long training, NumPy and PyTorch would round differently by as much as the tolerance.
     batch = {
         k: rng.uniform(np.maximum(b.low, -1.0), np.minimum(b.high, 1.0), shapes[k]).astype(b.dtype)
         for k, b in boxes.items()
     }
     training = model.policy.training
-    expected, _ = model.predict(batch, deterministic=True)  # leaves the training mode
+    expected, _ = model.predict(batch, deterministic=True)  # switches the training mode off
     model.policy.set_training_mode(training)
     scale = np.maximum(1.0, (space.high - space.low) / 2)
     off = float(np.max(np.abs(load_policy(written).act(batch) - expected) / scale))

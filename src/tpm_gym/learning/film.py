@@ -1,20 +1,25 @@
-"""Pictures of a policy at work: a video of episodes, a contact sheet of one."""
+"""Pictures of a policy at work: a video of several episodes, a contact sheet of one episode."""
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tpm_gym.learning.provenance import write_whole
-from tpm_gym.simulation.imaging import tile
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 Frame = NDArray[np.uint8]
 Play = Callable[[Callable[[Frame], object]], object]
 """Function that plays episodes, and calls its argument with every frame."""
 
-_ROWS, _COLUMNS = 2, 3
+_MOMENTS, _COLUMNS = 6, 3
+_GAP, _CAPTION, _FONT = 8, 32, 18  # pixels
 
 
 def write_video(path: Path, play: Play, fps: float) -> None:
@@ -30,15 +35,45 @@ def write_video(path: Path, play: Play, fps: float) -> None:
     write_whole(path, write)
 
 
-def write_contact_sheet(path: Path, play: Play) -> None:
-    """Write a PNG of six moments of an episode, evenly spaced up to the end of the motion."""
-    import imageio.v3 as imageio
-
+def write_contact_sheet(path: Path, play: Play, fps: float) -> None:
+    """Write a PNG of the six moments of an episode that differ most, each above its time."""
     frames: list[Frame] = []
     play(frames.append)
-    # Two frames differ if more than the last millimetres of a motion lie between them.
-    differ = [(frame != frames[-1]).any(axis=-1).mean() > 1e-2 for frame in frames]
-    last = max(np.flatnonzero(differ), default=len(frames) - 2) + 1
-    moments = np.linspace(0, last, _ROWS * _COLUMNS).round().astype(int)
-    sheet = tile([frames[moment] for moment in moments], _COLUMNS)
-    write_whole(path, lambda part: imageio.imwrite(part, sheet))
+    sheet = contact_sheet({f"{k / fps:.3g} s": frames[k] for k in _moments(frames)}, _COLUMNS)
+    write_whole(path, lambda part: sheet.save(part, "PNG"))
+
+
+def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
+    """Draw equally large pictures row by row, each above its caption."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width, _ = next(iter(pictures.values())).shape
+    rows = -(-len(pictures) // columns)
+    size = columns * (width + _GAP) - _GAP, rows * (height + _CAPTION)
+    sheet = Image.new("RGB", size, "white")
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=_FONT)
+    for place, (caption, picture) in enumerate(pictures.items()):
+        row, column = divmod(place, columns)
+        x, y = column * (width + _GAP), row * (height + _CAPTION)
+        sheet.paste(Image.fromarray(picture), (x, y))
+        middle = x + width / 2, y + height + _CAPTION / 2
+        draw.text(middle, caption, "black", font, anchor="mm")
+    return sheet
+
+
+def _moments(frames: list[Frame]) -> list[int]:
+    """Choose the first frame, the last, and repeatedly the one least like all chosen frames."""
+    pictures = np.stack(frames)[:, ::2, ::2].astype(np.int16)
+
+    def differences(index: int) -> NDArray[Any]:
+        found: NDArray[Any] = np.abs(pictures - pictures[index]).mean(axis=(1, 2, 3))
+        return found
+
+    last = len(frames) - 1
+    chosen, nearest = {0, last}, np.minimum(differences(0), differences(last))
+    while len(chosen) < min(_MOMENTS, len(frames)):
+        nearest[list(chosen)] = -1.0  # not again, even if all frames are equal
+        index = int(nearest.argmax())
+        chosen.add(index)
+        nearest = np.minimum(nearest, differences(index))
+    return sorted(chosen)

@@ -15,9 +15,9 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     """Hindsight experience replay for a reward of the form ``R(achieved, goal) - penalty``.
 
     Stable-Baselines3 relabels with ``compute_reward(achieved, new_goal, {})``. The info is empty,
-    so the penalty would vanish from the four samples of five that are relabelled. It does not
-    depend on the goal. With the stored reward r, the next achieved goal ag', the old goal g and the
-    new goal g', the reward for g' is therefore
+    so relabelled samples, four of five, would lose the penalty. The penalty does not depend on the
+    goal. With the stored reward r, the next achieved goal ag', the old goal g and the new goal g',
+    the reward for g' is therefore
 
         r' = r - R(ag', g) + R(ag', g')
     """

@@ -38,11 +38,11 @@ def write(policy: Path, evaluation: Path) -> Path:
 
 
 def check(card: Path, env_id: str, evaluation: Path) -> dict[str, Any]:
-    """Return what an evaluation tells of a policy, as entries of the card.
+    """Return the results in a file of ``tpm-gym evaluate --json`` as entries of the card.
 
     Raises:
-        ConfigError: ``evaluation`` is no such file, or belongs to another id than ``env_id``, or
-            the card would replace a file of others.
+        ConfigError: ``evaluation`` is no such file, its environment is not ``env_id``, or ``card``
+            exists and is no model card of tpm_gym.
     """
     if card.is_dir() or (
         card.exists() and _OURS not in card.read_text(encoding="utf-8", errors="replace")

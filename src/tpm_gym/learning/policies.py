@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tpm_gym.policy import Policy as ExportedPolicy
 
 SCRIPTED: Final = ("expert", "random")
-_ACTIONS: Final = 1  # not 0, which NumPy's seeds pad with
+_ACTIONS: Final = 1  # not 0: NumPy pads seeds with zeros, so [seed, 0] equals seed
 
 
 @dataclass(frozen=True)
@@ -52,8 +52,8 @@ class RandomPolicy:
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
         """Seed a generator for each episode with the episode's seed.
 
-        The environment draws its goal from a generator of the seed alone. Uniform actions of an
-        equal generator would be a function of the goal.
+        The environment draws its goal from a generator with this seed. Actions from an equal
+        generator would therefore depend on the goal.
         """
         self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
 
@@ -64,7 +64,7 @@ class RandomPolicy:
 
 
 class ExpertPolicy(Expert):
-    """Policy that acts with the scripted controller, which is deterministic."""
+    """Policy of the expert, which is deterministic."""
 
     def reset(self, observation: Observation, seeds: Sequence[int] = ()) -> None:
         """Plan the motion of the episodes."""

@@ -1,4 +1,4 @@
-"""Provenance of a result (versions, commit, machine, command), and files that are written whole."""
+"""Provenance of a result (versions, commit, machine, command); writing files in one step."""
 
 import json
 import os
@@ -11,9 +11,11 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
+from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning.errors import ConfigError
 
 _PACKAGES: Final = (
@@ -59,7 +61,7 @@ def git_commit() -> str | None:
 
 
 def machine() -> dict[str, Any]:
-    """Return the properties of the computer that decide its speed; nothing that identifies it."""
+    """Return the properties of the computer that decide its speed, and none that identify it."""
     processor = platform.processor()
     with suppress(OSError, IndexError):  # on most Linux systems the above is empty
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
@@ -89,6 +91,13 @@ def _portable(word: str) -> str:
         return word
     inside = path.is_relative_to(Path.cwd())
     return f"{option}{equals}{path.relative_to(Path.cwd()) if inside else path.name}"
+
+
+def require_packages(extras: Mapping[str, str]) -> None:
+    """Raise MissingPackageError if a package is missing; ``extras`` maps packages to extras."""
+    for package, extra in extras.items():
+        if find_spec(package) is None:
+            raise MissingPackageError(package, extra)
 
 
 def require_writable(option: str, path: Path) -> None:

@@ -10,6 +10,7 @@ several algorithms has such a mapping under the name of each: ``ppo``, ``sac``, 
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,9 +59,9 @@ class Recipe:
         """Return keyword arguments of the algorithm's constructor, with classes for names.
 
         Args:
-            update: Share of the training that lies between two updates. A learning rate that falls
-                to zero reaches zero that much after the last update. With 0, as in
-                Stable-Baselines3, the last update has a rate of zero and teaches nothing.
+            update: Steps between two updates, as a fraction of all steps. A falling learning rate
+                would reach zero one interval after the last update. With 0, as in
+                Stable-Baselines3, it is zero in the last update, which then changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):
@@ -102,6 +103,35 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
     return own if own.is_file() else RECIPES / f"{algorithm}.yml"
 
 
+def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
+    """Return the alphabetically first algorithm with a recipe for an id.
+
+    If there is none, return the first one with a recipe that the id may use, or else ``"sac"``.
+
+    Args:
+        env_id: ``id`` or ``module:id``.
+        engine: Engine to train in.
+        path: File of the recipes; None for the shipped ones.
+    """
+    found = {}
+    for algorithm in sorted(ALGORITHMS):
+        with suppress(ConfigError):  # complete() raises it again for the chosen algorithm
+            recipe = read_recipe(path or recipe_file(algorithm, engine), algorithm, env_id)
+            found[algorithm] = recipe.written_for
+    own = [algorithm for algorithm, name in found.items() if name == env_id.rpartition(":")[2]]
+    return next(iter([*own, *found]), "sac")
+
+
+def shipped_for(env_id: str) -> list[str]:
+    """Return the options of ``tpm-gym train`` that select the shipped recipes for an id."""
+    found = []
+    for file in sorted(RECIPES.glob("*.yml"), key=lambda file: file.stem):
+        algorithm, _, engine = file.stem.partition("-")
+        if env_id.rpartition(":")[2] in read_recipes(file, algorithm):
+            found.append(f"--algo {algorithm}" + (f" --engine {engine}" if engine else ""))
+    return found
+
+
 def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
     """Return entries of a recipe with classes in place of their names."""
     found = dict(entries)
@@ -129,12 +159,8 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
         name = known
         recipes[name].pop("demonstrations", None)
     if name not in recipes:
-        elsewhere = [
-            f"; --engine {file.stem.partition('-')[2]} has one"
-            for file in RECIPES.glob(f"{algorithm}-*.yml")
-            if name in read_recipes(file, algorithm)
-        ]
-        there = f"it has {', '.join(recipes) or 'none'}{''.join(elsewhere)}"
+        elsewhere = "".join(f"; {options} has one" for options in shipped_for(name)[:1])
+        there = f"it has {', '.join(recipes) or 'none'}{elsewhere}"
         own = "a file of yours with one is --recipe FILE"
         raise ConfigError(f"{path}: no recipe of {algorithm} for {name}; {there}; {own}")
     arguments = dict(recipes[name])
@@ -165,7 +191,7 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
-    """Check recipes, name -> entries."""
+    """Raise ConfigError if recipes (name -> entries) have an unknown key or an invalid value."""
     entries = ALGORITHMS[algorithm].entries()
     kind: Any = dict[str, entries]  # type: ignore[valid-type]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)

@@ -1,8 +1,8 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
-The training is that of the recipe: PPO where it has a recipe for the id, else SAC. The policy acts
-as in training, with its exploration. Episodes are spread evenly over the steps of the training
-after its demonstrations; they have seeds of their own and change nothing about the training.
+The algorithm is that of ``tpm-gym train`` without ``--algo``. The policy acts as in training, with
+its exploration. Episodes are spread evenly over the steps of the training after its demonstrations.
+They have seeds of their own and do not affect the training.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,7 +19,6 @@ from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
 from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.policies import TrainedPolicy
-from tpm_gym.learning.recipes import read_recipes, recipe_file
 from tpm_gym.learning.rollout import Policy
 from tpm_gym.learning.training import make_model, training_envs_of
 
@@ -64,15 +63,14 @@ def episodes(
     """Train, and return ``count`` episodes that ``record`` made.
 
     Args:
+        env: Id, or ``module:id``.
+        options: Options of the environments.
+        count: Number of episodes, spread evenly over the moments.
         seed: Seed of the training, and of the first episode.
-        steps: Steps of the training; UNSET for those of the recipe.
+        steps: Steps of the training; UNSET for the recipe's number.
         record: Called with environments, policy, number of episodes and first seed.
     """
-    engine = options.engine
-    name = env.rpartition(":")[2]
-    algo = "ppo" if name in read_recipes(recipe_file("ppo", engine), "ppo") else "sac"
-    given = TrainingConfig(algo=algo, env=env, seed=seed, steps=steps, env_options=options)
-    config = complete(given)
+    config = complete(TrainingConfig(env=env, seed=seed, steps=steps, env_options=options))
     torch.set_num_threads(config.threads)
     found: list[Any] = []
     parts = [count * moment // MOMENTS for moment in range(MOMENTS + 1)]

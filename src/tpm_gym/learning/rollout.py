@@ -146,7 +146,7 @@ def run_episodes(
         envs: Environments with next-step autoreset, as many as run at a time; left open.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
-        on_episodes: Called with the number of episodes that ended, to move a progress bar.
+        on_episodes: Called with the number of episodes that have just ended, as for a progress bar.
 
     Raises:
         RolloutError: A value of a record is not finite.
@@ -189,7 +189,7 @@ def _run_together(
 
 
 def _record(seed: int, steps: Mapping[str, NDArray[Any]], events: Sequence[str]) -> Episode:
-    """Condense an episode from its steps' values (n, ...)."""
+    """Compute the outcome of an episode from the values (n, ...) of its n steps."""
     for name, values in steps.items():
         if not np.isfinite(values).all():
             place = tuple(np.argwhere(~np.isfinite(values))[0].tolist())

@@ -1,4 +1,4 @@
-"""Folder of a run: names of its files, and who may write or delete there.
+"""Folder of a run: names of its files, and rules for writing and deleting them.
 
 Only files that a run writes are deleted, by name. A policy is deleted only if the user asks for it.
 """
@@ -28,7 +28,7 @@ TESTS: Final = "tests"
 BEST_FILE: Final = "best.zip"
 LAST_FILE: Final = "last.zip"
 WHOLE: Final = "[!.]*.json"
-"""Pattern of JSON files, without the hidden parts that a process leaves if it is killed."""
+"""Pattern of complete JSON files; partial files, which a killed process leaves, are hidden."""
 
 _BEST: Final = (BEST_FILE, "best.json", "best.safetensors")
 LAST: Final = (LAST_FILE, "last.json", "last.safetensors")
@@ -50,16 +50,16 @@ _Evaluation = TypedDict(
         "return": _Estimate,
     },
 )
-"""Entries of an evaluation that are read again."""
+"""Entries of an evaluation that a resumed training needs."""
 RESTORED: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, *_BEST)
-"""Files that a checkpoint holds. Resuming sets them back, and writes later entries again."""
+"""Files that a checkpoint holds. Resuming restores them, and writes later entries again."""
 
 
 def prepare(run: Path, overwrite: bool) -> None:
     """Make the folder of a new run; with ``overwrite``, delete an earlier run, no other files."""
     try:
         run.mkdir(parents=True, exist_ok=True)
-        # A process that is killed in its first moment leaves a hidden part of a file.
+        # A process that is killed at its start leaves a hidden, partial file.
         if all(entry.name.startswith(".") for entry in run.iterdir()):
             return
     except OSError as error:
@@ -93,7 +93,7 @@ def description(run: Path) -> dict[str, Any] | None:
 def resume_command(run: Path) -> str:
     """Return the command line that resumes a run.
 
-    No file decides what is imported, so an id ``module:id`` is given again.
+    It repeats an id ``module:id``, because no module is imported only because a file names it.
     """
     env = str((description(run) or {}).get("env", ""))
     return shlex.join(["tpm-gym", "resume", str(run), *(["--env", env] if ":" in env else [])])
@@ -179,7 +179,7 @@ def claimed(run: Path) -> Iterator[None]:
 def disk_errors_named(run: Path, store: CheckpointStore) -> Iterator[None]:
     """Convert errors of a full or broken disk to a RunError that says how to continue.
 
-    So are the errors of a pipe to a process that has ended.
+    Errors of a pipe to a process that has ended are converted, too.
     """
     try:
         yield

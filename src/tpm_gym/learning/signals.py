@@ -12,7 +12,8 @@ from types import FrameType
 class SignalListener:
     """Store of the first request to stop; the second request ends the process at once.
 
-    An exception in the middle of an update could leave a half-updated network to save.
+    The first is stored, not raised: an exception in the middle of an update could leave a
+    half-updated network to save.
     """
 
     received: signal.Signals | None = None

@@ -39,6 +39,7 @@ from tpm_gym.learning.errors import (
     RunError,
 )
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.recipes import shipped_for
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import (
     CHECKPOINTS,
@@ -74,21 +75,33 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
     console = console or Console()
     import_module_of(config.env)
     check_env_id(config.env)
-    with closing(make_env(**config.env_arguments)) as env:  # refused before all else
+    with closing(make_env(**config.env_arguments)) as env:  # wrong options fail here, before all
         size = flatdim(env.observation_space)
     asked, config = config.steps, complete(config)
     asked = config.recipe.n_timesteps if asked is UNSET else asked
     _require_room(config, size)
     run_folder.prepare(config.run, config.overwrite)
-    if config.steps != asked:
+    if config.demonstrations != (few := config.recipe.demonstrations.get("episodes", 0)):
         _say(
             console,
-            f"note: {asked:,} steps were asked for, and rounded up to whole rollouts of "
-            f"{config.rollout:,} steps",
+            f"note: {few:,} demonstrations were asked for, and rounded up to "
+            f"{config.demonstrations:,}, equally many in each of {config.envs:,} environments",
+        )
+    if config.steps != asked:
+        shown = f"{config.demonstrated:,} of demonstrations and " if config.demonstrated else ""
+        rollouts = (config.steps - config.demonstrated) // config.rollout
+        _say(
+            console,
+            f"note: {asked:,} steps were asked for, and rounded up to {config.steps:,}: {shown}"
+            f"{rollouts:,} rollouts of {config.rollout:,}",
         )
     if config.recipe.written_for != config.env.rpartition(":")[2]:
-        other = config.recipe.written_for
-        _say(console, f"note: the recipe is that of {other}; give your own with --recipe FILE")
+        there = "".join(f"; the id has one with {own}" for own in shipped_for(config.env)[:1])
+        _say(
+            console,
+            f"note: the recipe of {config.algo} is that of {config.recipe.written_for}{there}; "
+            "give your own with --recipe FILE",
+        )
     starts = config.argument("learning_starts") or 0
     if config.steps <= starts:
         _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
@@ -160,7 +173,7 @@ def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str,
 
 @contextmanager
 def _foreign_named(run: Path) -> Iterator[None]:
-    """Raise an error of a checkpoint with a right sum, and entries that no training writes."""
+    """Convert errors of a checkpoint whose checksum is right, but whose entries are not."""
     try:
         yield
     except TPMError:
@@ -220,7 +233,7 @@ class _Session:
         """Set model, files and logs to the beginning or the checkpoint.
 
         Returns:
-            Time of the training until now, s, and its evaluations.
+            Training time so far, s, and the evaluations so far.
         """
         config, content, seconds, evaluations = self.config, self.content, 0.0, []
         if content is None:
@@ -234,6 +247,8 @@ class _Session:
         start = f"from step {content.step if content else 0:,} to "
         start = start if "resumed" in self.description else ""
         _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
+        count, every = config.eval_episodes, config.eval_every
+        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
         iterations = max(0, model.num_timesteps - config.demonstrated) // config.rollout
         model.set_logger(training_state.make_logger(config.run, content, iterations))
         return seconds, evaluations
@@ -241,7 +256,7 @@ class _Session:
     def _learn(
         self, model: BaseAlgorithm, called: list[BaseCallback], listener: SignalListener
     ) -> signal.Signals | None:
-        """Take the steps that are left; return the signal that stopped it."""
+        """Train for the remaining steps; return the signal that stopped the training, or None."""
         steps = self.config.steps - model.num_timesteps
         try:
             model.learn(steps, callback=called, reset_num_timesteps=self.content is None)
@@ -287,7 +302,7 @@ class _Session:
             self._test()
 
     def complete(self) -> bool:
-        """Make what a kill after the last step left out; return whether the test was."""
+        """Make curve and last test if a kill prevented them; return whether the test was made."""
         config = self.config
         if not (config.run / CURVE_FILE).exists():
             evaluations = run_folder.evaluations(config.run)
@@ -305,7 +320,12 @@ class _Session:
     def _test(self) -> None:
         """Test the best policy in the analytic engine and in PyBullet; print success and events."""
         config = self.config
-        _say(self.console, f"testing {config.test_episodes} held-out episodes in each engine ...")
+        best = max(run_folder.evaluations(config.run), key=callbacks.quality)["steps"]
+        _say(
+            self.console,
+            f"testing the best policy, of step {best:,}, in {config.test_episodes} held-out "
+            "episodes in each engine ...",
+        )
         rates: dict[str, list[str]] = {}
         for engine in _TESTED:
             test = EvaluationConfig(
@@ -340,7 +360,7 @@ def _require_room(config: TrainingConfig, numbers: int) -> None:
     size = config.argument("buffer_size") or config.rollout
     try:
         np.empty((size, 2, numbers), np.float32)
-    except (MemoryError, ValueError) as error:  # beyond all addresses it is a ValueError
+    except (MemoryError, ValueError) as error:  # ValueError: larger than the address space
         raise ConfigError(f"--recipe {config.recipe_file}: {name} {size}: {error}") from error
 
 
@@ -371,7 +391,7 @@ def make_training_envs(config: TrainingConfig) -> VecEnv:
     """Build the training environments: in processes, or together in the analytic engine."""
     several = config.envs > 1
     if several and config.env_options.in_batches:
-        # Episodes that end one by one make the batches of an on-policy algorithm even.
+        # Episodes that end at different steps give an on-policy batch all parts of an episode.
         options = {**config.env_arguments, "autoreset_mode": "SameStep", "stagger": True}
         envs = AnalyticVecEnv(make_envs(count=config.envs, **options))
         envs.seed(config.seed)

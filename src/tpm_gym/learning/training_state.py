@@ -1,10 +1,12 @@
 """State of a training between two rollouts, saved and restored bit by bit.
 
-A training that is restored there continues as if it had not been interrupted, on one thread of one
-kind of machine. A resumed hindsight training looks untrained if one of three things is missing: the
-count of steps (Stable-Baselines3 acts at random for the first ``learning_starts`` steps), the
-optimisers, or the unfinished episode (joined to another episode in the replay buffer, it teaches
-goals that were never reached).
+A restored training continues as if it had not been interrupted, on one thread of one kind of
+machine. A resumed hindsight training looks untrained if one of three things is missing:
+
+- the count of steps: Stable-Baselines3 acts at random for the first ``learning_starts`` steps;
+- the optimisers;
+- the unfinished episode: the replay buffer would join it to another episode, and relabel its steps
+  with goals that were never reached.
 """
 
 import io
@@ -64,10 +66,10 @@ class _State(TypedDict):
 
 
 class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
-    """Record of the unfinished episode: its seed and its actions.
+    """Wrapper that records the seed and the actions of the unfinished episode.
 
-    PyBullet keeps state that cannot be read. Repeating an episode is exact, takes a tenth of a
-    second, and also restores the wrappers below.
+    PyBullet has state that cannot be read, so the episode is repeated instead. This is exact, takes
+    a tenth of a second, and also restores the wrappers below.
     """
 
     def __init__(self, env: GoalEnv) -> None:
@@ -96,7 +98,7 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
         return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": self._actions}
 
     def replay(self, episode: Mapping[str, Any]) -> Observation | None:
-        """Repeat an episode; return its last observation, None if the physics refuse it."""
+        """Repeat an episode; return its last observation, or None if it raises a TPMError."""
         self.unwrapped.np_random.bit_generator.state = episode["rng"]
         try:
             observation, _ = self.reset(seed=episode["seed"])
@@ -111,8 +113,8 @@ def capture(model: BaseAlgorithm, run: Path, seconds: float, finished: bool = Fa
     """Return the state of a training between two rollouts; arrays of the buffer are views.
 
     Args:
-        model: Its environments are an ``AnalyticVecEnv`` or of :class:`EpisodeRecorder`.
-        seconds: Time of the training until now, s.
+        model: Its environments are an ``AnalyticVecEnv``, or each has an :class:`EpisodeRecorder`.
+        seconds: Training time so far, s.
     """
     envs: Any = model.env
     observations: Any = model._last_obs
@@ -147,7 +149,7 @@ def restore_files(run: Path, content: Content) -> None:
     """Set the files of a run back to a checkpoint; delete the files of later policies."""
     clear_tests(run)
     # last.zip marks a finished run, so an earlier one must not stay.
-    for name in {*RESTORED, *LAST} - {CONFIG_FILE}:  # it is written anew at once
+    for name in {*RESTORED, *LAST} - {CONFIG_FILE}:  # the caller writes config.json anew
         if name in content.files:
             write_whole(run / name, partial(Path.write_bytes, data=content.files[name]))
         else:
@@ -173,7 +175,7 @@ def restore(model: BaseAlgorithm, content: Content) -> float:
     )
     _restore_buffer(model, content.arrays)
     _restore_episodes(model, state, content.arrays)
-    # The generators last, since the lines above may draw
+    # Generators are restored last, since the lines above may draw from them.
     _restore_tensors(model, content.files[TENSORS])
     _restore_rng(model, state["rng"])
     return float(state["seconds"])
@@ -288,7 +290,7 @@ class _Log(Logger):
 
 
 def make_logger(run: Path, content: Content | None, iterations: int) -> Logger:
-    """Open the log of a run, as it was at a checkpoint after so many iterations."""
+    """Open the log of a run as it was at a checkpoint, after ``iterations`` rollouts."""
     path = run / PROGRESS_FILE
     before = "" if content is None or not path.is_file() else path.read_text(encoding="utf-8")
     table = CSVOutputFormat(str(path))  # empties the file

@@ -19,12 +19,12 @@ from typing import Annotated, Any, Final
 import tyro
 import yaml
 
-from tpm_gym.errors import MissingPackageError
 from tpm_gym.learning import provenance
 from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.configuration import (
     UNSET,
     EnvOptions,
+    GivenEnvOptions,
     Randomised,
     TrainingConfig,
     check_least,
@@ -40,7 +40,8 @@ RECIPE_FILE: Final = "recipe.yml"
 """File of the best recipe in the folder of a search; give it to ``train --recipe``."""
 
 _MOST_JOBS: Final = 10_000
-_SHARED: Final = ("algo", "env", "steps", "env_options", "randomisation")  # with TrainingConfig
+# Options that TuneConfig and TrainingConfig have in common.
+_SHARED: Final = ("algo", "env", "steps", "env_options", "randomisation")
 
 _SPACE: Final[Mapping[str, Sequence[float]]] = {
     "learning_rate": (0.0003, 0.0006, 0.001, 0.002, 0.003),
@@ -76,7 +77,7 @@ class TuneConfig:
     """Steps of each training."""
 
     jobs: Annotated[int, unset(int, "one for each core", "INT")] = UNSET
-    """Trainings at a time, on this machine or on the Ray cluster that RAY_ADDRESS names."""
+    """Trainings at a time, on this computer or on the Ray cluster that RAY_ADDRESS names."""
 
     seed: int = 0
     """Seed of the search; training i has this seed + i."""
@@ -84,7 +85,7 @@ class TuneConfig:
     folder: Annotated[Path, unset(Path, "runs/tune-<env>-<algo>", "FOLDER")] = UNSET
     """New folder for the runs, their logs and the best recipe."""
 
-    env_options: tyro.conf.OmitArgPrefixes[EnvOptions] = field(default_factory=EnvOptions)
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
     """Domain randomisation, as in train."""
@@ -100,6 +101,7 @@ def tune(config: TuneConfig) -> Path:
         ConfigError: An option is not valid, the folder exists, or no training ended.
         MissingPackageError: Ray Tune or Optuna is missing.
     """
+    provenance.require_packages({"ray": "cluster", "optuna": "cluster"})
     check_least(config, 1, "trials", "jobs", "steps")
     check_least(config, 0, "seed")
     if (config.jobs or 1) > _MOST_JOBS:
@@ -125,13 +127,10 @@ def tune(config: TuneConfig) -> Path:
 
 def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[str, Any]:
     """Return the changes of the best trial."""
-    try:
-        import ray
-        from optuna.samplers import TPESampler
-        from ray import tune as ray_tune
-        from ray.tune.search.optuna import OptunaSearch
-    except ImportError as error:
-        raise MissingPackageError("ray[tune] and optuna", "cluster") from error
+    import ray
+    from optuna.samplers import TPESampler
+    from ray import tune as ray_tune
+    from ray.tune.search.optuna import OptunaSearch
 
     here = Path.cwd()  # Ray Tune works in folders of its own
 
@@ -154,14 +153,15 @@ def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[s
 
 @contextmanager
 def _started(ray: Any, jobs: int | None) -> Iterator[None]:
-    """Start Ray on this machine, or join the cluster at RAY_ADDRESS, if that is not done yet."""
+    """Start Ray on this computer or join the cluster at RAY_ADDRESS, unless Ray runs already."""
     if ray.is_initialized():
         yield
         return
     address = os.environ.get("RAY_ADDRESS")
     quiet = {"include_dashboard": False, "log_to_driver": False}
     try:
-        # "local": not a cluster of others that runs here. Ray refuses a number of CPUs for one.
+        # "local" never joins a cluster of others on this computer. For the cluster at RAY_ADDRESS,
+        # Ray refuses num_cpus.
         ray.init(**quiet) if address else ray.init("local", num_cpus=jobs, **quiet)
     except ConnectionError as error:
         raise ConfigError(f"RAY_ADDRESS {address}: {error}; start Ray there") from error
@@ -190,8 +190,7 @@ def _train(
     _write(recipe, base, changes)
     options = {"algo": base.algo, "env": base.env, "steps": base.steps, "seed": seed + number}
     options |= {"recipe": recipe, "run": run, "test-episodes": 0, **base.env_options.given()}
-    flags = [f"--{key}" for key, value in options.items() if value is True]
-    words = [f"--{key}={value}" for key, value in options.items() if value is not True] + flags
+    words = [f"--{key}={value}" for key, value in options.items()]
     words += ["--randomisation", *base.randomisation] if base.randomisation else []
     # In a process of its own: Ray Tune calls this in a thread, which cannot receive signals.
     with log.open("w", encoding="utf-8") as file:

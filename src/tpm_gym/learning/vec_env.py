@@ -25,15 +25,15 @@ _ENVS, _SIMULATION, _ENGINE = "envs/", "simulation/", "engine/"  # prefixes of a
 class AnalyticVecEnv(VecEnv):
     """Adapter of a :class:`~tpm_gym.envs.vector.TPMVectorEnv` to Stable-Baselines3.
 
-    At the end of an episode, infos hold ``terminal_observation``, ``TimeLimit.truncated``,
-    ``is_success`` and ``episode``, which the algorithms read; otherwise nothing.
+    At the end of an episode, its info holds ``terminal_observation``, ``TimeLimit.truncated``,
+    ``is_success`` and ``episode``, which the algorithms read. At other steps infos are empty.
 
     Args:
         envs: Environments with same-step autoreset: ``gym.make_vec(id, num_envs=256,
             engine="analytic", autoreset_mode="SameStep", stagger=True)``.
 
     Raises:
-        ConfigurationError: ``envs`` are no such environments.
+        ConfigurationError: ``envs`` is no ``TPMVectorEnv``, or has no same-step autoreset.
     """
 
     def __init__(self, envs: TPMVectorEnv) -> None:
@@ -101,7 +101,7 @@ class AnalyticVecEnv(VecEnv):
     # -- checkpoints ----------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """Return the state on which the next steps depend: plain data, and arrays by name."""
+        """Return everything that the next steps depend on, as plain data and arrays by name."""
         (snapshot,) = self.envs.save_state()
         simulation = snapshot.simulation
         plants = simulation.plants if any(plant != NOMINAL for plant in simulation.plants) else ()

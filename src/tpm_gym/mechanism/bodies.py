@@ -19,10 +19,10 @@ from tpm_gym.arrays import FloatArray, Vector
 ALUMINIUM, STEEL = 2700.0, 7850.0  # kg/m^3
 
 LEVEL: Final = (0.0, 0.0, 0.0)
-"""Roll, pitch and yaw of a frame that is parallel to another."""
+"""Roll, pitch and yaw of a frame that is parallel to its parent's, rad."""
 
 ALONG: Final = {"x": (0.0, math.pi / 2, 0.0), "y": (math.pi / 2, 0.0, 0.0), "z": LEVEL}
-"""Roll, pitch and yaw that turn a cylinder along z onto an axis."""
+"""Roll, pitch and yaw that turn a cylinder along z onto the named axis, rad."""
 
 
 def rotation_of(rpy: Vector) -> FloatArray:
@@ -46,10 +46,11 @@ class Solid:
         size: Box: edges (x, y, z). Cylinder: (radius, length, 0). In m.
         centre: Position in the link's frame, m.
         density: Density of the material, kg/m^3; zero for parts that are only drawn.
-        bore: Box: edges of the hollow (0 for solid faces). Cylinder: (inner radius, length, 0).
+        bore: Size of the hollow, m. Box: edges (x, y, z). Cylinder: (inner radius, length, 0). All
+            are 0 if there is none.
         axis: Axis of a cylinder in the solid's frame: ``"x"``, ``"y"`` or ``"z"``.
         colour: Name of a colour in :mod:`tpm_gym.mechanism.urdf`.
-        collides: Whether the engine should collide it.
+        collides: Whether the solid can touch objects and the table.
         rpy: Roll, pitch and yaw of the solid's frame in the link's frame, rad, as in URDF.
     """
 
@@ -70,7 +71,7 @@ class Solid:
 
     @property
     def moments(self) -> FloatArray:
-        """Principal moments (3,) about the centre, along the solid's axes, kg m^2."""
+        """Principal moments of inertia (3,) about the centre, along the solid's axes, kg m^2."""
         return self._moments(self.size) - self._moments(self.bore)
 
     @property
@@ -219,10 +220,10 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Mechanism:
-    """Everything an engine needs to build the mechanism.
+    """Links, joints and loop closures of a robot, as engines load them.
 
     Attributes:
-        links: Parents before children; the first is the base.
+        links: Links, parents before children; the first is the base.
         closures: The ball joints that close the loops.
         platform: Name of the platform link.
         point_p: Point P in the platform's frame, m.
@@ -276,7 +277,8 @@ class Mechanism:
         """Compute positions and orientations of all links in the base's frame.
 
         Args:
-            joints: Position (...,) of each joint by name, rad or m; slides may be left out.
+            joints: Position (...,) of each joint by name, rad or m. A slide that is left out is
+                at 0 m.
         """
         shape = np.shape(next(iter(joints.values())))
         identity = np.broadcast_to(np.eye(3), (*shape, 3, 3))

@@ -52,7 +52,7 @@ def moving_joints(mechanism: Mechanism) -> list[str]:
 def rates(
     mechanism: Mechanism, places: Mapping[str, Place], name: str, offset: Vector
 ) -> tuple[FloatArray, FloatArray]:
-    """Return velocity (3, n) m/rad of a point of a link, and angular velocity (3, n), per joint."""
+    """Return velocity (m/rad) of a link's point and angular velocity of the link, (3, joints)."""
     joints, point = moving_joints(mechanism), places[name].point(offset)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
     while (joint := mechanism.link(name).joint) is not None:
@@ -78,18 +78,19 @@ def rank_of(values: FloatArray) -> int:
 
 
 def require_sound(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
-    """Refuse a mechanism that three motors do not move in translation alone.
+    """Refuse a mechanism unless its three motors move the platform in pure translation.
 
     Args:
         mechanism: Links, joints and closures.
         joints: Position of each joint by name, rad or m.
 
     Raises:
-        ConfigurationError: If a name is missing or not unique, a parent stands behind its child, a
-            loop is open at these joint positions, the platform turns, or it has more or fewer than
-            three degrees of freedom. Redundant rows are allowed; the TPM has one. If a joint or a
-            solid is of an unknown kind, an axis has not length 1, or a solid no positive size.
-        SingularityError: If the rank of the closures is uncertain there.
+        ConfigurationError: If a name is missing or not unique, a link comes before its parent, a
+            loop is open at these joint positions, the platform turns, or the motors, or
+            motors and platform together, do not have exactly three degrees of freedom. Redundant
+            closure equations are allowed; the TPM has one. Or if a joint or a solid is of an
+            unknown kind, an axis has not length 1, or a solid has no positive size.
+        SingularityError: If the rank of the closures' Jacobian is uncertain at these positions.
     """
     _require_parts(mechanism)
     _require_tree(mechanism, joints)
@@ -132,7 +133,7 @@ def _require_parts(mechanism: Mechanism) -> None:
 
 
 def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
-    """Refuse names that are missing or not unique, and links before their parents."""
+    """Refuse missing or repeated names, links without mass, and links before their parents."""
     links, names = [link.name for link in mechanism.links], moving_joints(mechanism)
     held = [link.joint for link in mechanism.links[1:]]
     if mechanism.links[0].joint or None in held:

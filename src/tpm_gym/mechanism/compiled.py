@@ -22,7 +22,7 @@ from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
 ASSEMBLY_LIMIT = 0.010
-"""Largest distance between platform and forward kinematics in the same assembly mode, m."""
+"""Distance of P from the forward kinematics above which the assembly mode is another one, m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class CompiledMachine(Machine):
     @cached_property
     @abstractmethod
     def _constants(self) -> FloatArray:
-        """Signs of the modes, and gravity: what all machines as built share."""
+        """Constants that are equal for all robots: signs of the modes, and gravity."""
 
     def inverse(self, position: ArrayLike, built: FloatArray | None = None) -> FloatArray:
         """See :class:`Machine`."""
@@ -181,7 +181,7 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
     plain = type(values) is np.ndarray and values.dtype.char == "d"  # the common case, fast
     array = np.ascontiguousarray(values if plain else numbers(name, values))
     if array.shape[-1] != length:
-        raise InputError(name, array.shape, f"an array of shape (..., {length}), by shape")
+        raise InputError(f"shape of {name}", array.shape, f"(..., {length})")
     return array if array.flags.writeable else array.copy()
 
 
@@ -193,8 +193,8 @@ def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
         try:
             array = np.broadcast_to(array, like.shape)
         except ValueError as error:
-            valid = f"of shape {like.shape}, like theta, or of one that broadcasts to it"
-            raise InputError("vectors", array.shape, valid) from error
+            valid = f"{like.shape}, like theta, or one that broadcasts to it"
+            raise InputError("shape of vectors", array.shape, valid) from error
     return _rows(array)
 
 

@@ -82,8 +82,9 @@ CUP = VacuumCup()
 
 
 def sealed(lip: Any, axis: Any, position: Any, quaternion: Any, size: tuple[float, float]) -> Any:
-    """Return whether the whole lip lies on the top face of a square block.
+    """Return whether the whole lip lies on the top face of a square block, so that it seals.
 
+    Gap and tilt may be up to ``CUP.seal_gap`` and ``CUP.seal_tilt``.
     Arrays (n,) in place of numbers give an array (n,). Vectors are in the world frame.
 
     Args:

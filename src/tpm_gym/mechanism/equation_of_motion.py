@@ -197,6 +197,6 @@ def _side_by_side(states: Mapping[str, ArrayLike]) -> FloatArray:
         table: FloatArray = namespace_of(*arrays).join(arrays)
     except (ValueError, RuntimeError) as error:  # numpy's and torch's
         shapes = [tuple(array.shape) for array in arrays]
-        valid = "of shapes (..., 3) that go together, by shape"
+        valid = "of shapes (..., 3) that go together"
         raise InputError(", ".join(states), shapes, valid) from error
     return table

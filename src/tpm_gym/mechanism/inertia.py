@@ -1,10 +1,12 @@
 """Constants of bodies for closed-form dynamics.
 
-A rigid bar from B to C, with mass m, length l, its centre at the share s of its length, and moment
-of inertia I across it, has the kinetic energy of two coupled points:
+A rigid bar from B to C has the kinetic energy of two coupled points:
 
     T = (a |vB|^2 + 2 b vB . vC + c |vC|^2) / 2,
     a = m (1 - s)^2 + I / l^2,  b = m s (1 - s) - I / l^2,  c = m s^2 + I / l^2.
+
+Here m is its mass, l its length, s l the distance of its centre of mass from B, and I its moment of
+inertia about an axis through this centre, across the bar.
 
 Arms (with a fixed near end) and rods are such bars. A body that only translates is a mass at the
 point with which it moves. Some bodies swing with their rods, and some rods also turn about their
@@ -29,9 +31,10 @@ _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
 
 class Swing(NamedTuple):
-    """Inertia of a leg's swing without its rods' masses: T = (fixed + spin out^2) rate^2 / 2.
+    """Inertia of a leg's swing in addition to its bars: T = (fixed + spin out^2) rate^2 / 2.
 
-    Here ``out`` is the component of BC along the swing's axis, m.
+    Here ``rate`` is the angular velocity of the swing, rad/s, and ``out`` is the component of BC
+    along the swing's axis, m.
 
     Attributes:
         fixed: Moment of inertia about the axis of the swing, kg m^2.
@@ -43,10 +46,16 @@ class Swing(NamedTuple):
 
 
 def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
-    """Compute the force at C for the swing of a leg; the force at B is opposite.
+    """Compute the force at C, N, that accelerates the swing of a leg; the force at B is opposite.
 
-    The rod is along (out, level, z), and the swing is the angle of (level, z). The force follows
-    from Lagrange's equation of (fixed + spin out^2) rate^2 / 2.
+    It follows from Lagrange's equation of the kinetic energy of :class:`Swing`.
+
+    Args:
+        rod: BC as (out, level, z), m. The swing is the angle of (level, z), with its axis along
+            ``out``.
+        rates: Derivatives of ``rod`` by time, m/s.
+        changes: Second derivatives of level and z by time, m/s^2.
+        m: Inertia of the swing.
     """
     (out, level, z), (out_rate, level_rate, z_rate), (level_change, z_change) = rod, rates, changes
     over = 1.0 / (level * level + z * z)
@@ -58,10 +67,10 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
 
 
 class Bodies:
-    """Moving links with their factors, by name; keeps the names of the links that were used."""
+    """Moving links by name, with factors of their masses; remembers which links were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Set the factors of mass and inertia, one for each moving link; empty if all are 1.
+        """Set factors of mass and inertia, one for each moving link; none if all are 1.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.
@@ -91,12 +100,16 @@ class Bodies:
         return self.factors[name] * float(self._link(name).inertia[axis, axis])
 
     def shaft(self, name: str, axis: int) -> tuple[float, float]:
-        """Return mass and moment of inertia of a body about its own axis through its centre."""
+        """Return mass (kg) and moment of inertia (kg m^2) of a body about ``axis`` of its frame.
+
+        Raises:
+            ConfigurationError: If its centre of mass is not on this axis.
+        """
         self._require_on_axis(name, [k for k in (X, Y, Z) if k != axis])
         return self.mass(name), self.moment(name, axis)
 
     def bar(self, name: str, along: int, about: int, length: float) -> FloatArray:
-        """Compute a, b and c of a bar that turns in a plane, about an axis across the bar."""
+        """Compute a, b, c (see the module), kg, of a bar that turns in a plane about ``about``."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k not in (along, about)])
         share = float(self._link(name).centre_of_mass[along]) / length
         mass, turning = self.mass(name), self.moment(name, about) / length**2
@@ -104,7 +117,7 @@ class Bodies:
         return np.array([near, mass * share * (1 - share) - turning, far])
 
     def round_bar(self, name: str, along: int, length: float) -> FloatArray:
-        """Compute a, b and c of a bar that turns in space, and so must be round."""
+        """Compute a, b, c (see the module), kg, of a bar that turns in space; it must be round."""
         one, other = (k for k in (X, Y, Z) if k != along)
         self._require_on_axis(name, [one, other])
         moments = self._link(name).inertia

@@ -1,12 +1,16 @@
 """Compiled loops over rows of a mechanism's kinematics and dynamics.
 
-A loop takes a tuple of inputs (m, 3), ``limit`` (m), ``built``, ``machine``, and a tuple of arrays
-for its results, which are NaN where there is none. Row i of m is of the machine
-``built[i // (m // b)]``, of b machines. A row of ``built`` (b, k) holds the lengths (m) and the
-constants of the dynamics. ``machine`` holds the signs of the modes, and at its end gravity (3)
-m/s^2. Each row is computed by itself, so that it has the same bits alone and among thousands.
+A loop takes five arguments:
 
-Rows are copied to columns of a block, over which the compiler computes several rows at a time.
+* ``inputs``: a tuple of arrays (n, 3).
+* ``limit``: a distance, m, for the loops that compare positions.
+* ``built``: (b, k), the lengths (m) and the constants of the dynamics of b machines. Row i of the n
+  rows belongs to machine ``built[i // (n // b)]``.
+* ``machine``: the signs of the modes, then gravity (3), m/s^2.
+* ``results``: a tuple of arrays with n rows, which the loop fills; NaN where there is no solution.
+
+A row does not depend on the others, so it has the same bits alone and among thousands. Rows are
+copied to columns of a block, so that the compiler can compute several rows at a time.
 """
 
 import math
@@ -31,21 +35,24 @@ _NONE: Final = (0.0, 0.0, 0.0)
 class Equations(NamedTuple):
     """Functions of one mechanism that the loops call; all of them are compilable.
 
+    Each attribute is given as (arguments) -> results. ``rates`` and ``changes`` are the first and
+    second derivatives of the joint positions by time.
+
     Attributes:
-        modes: Signs of the modes, of ``machine``.
-        lengths: Lengths of row j of columns.
-        inertia: Constants of the dynamics of row j of columns.
-        posture: Joint positions for a point, modes and lengths, and whether they are real.
-        pose: Configuration at joint positions, for modes and lengths; whether it is real; and
-            whether it is in the working mode.
-        position: Point P of a configuration.
-        regular: Whether J exists, for a configuration and lengths.
-        velocity: Rows of J of a configuration.
-        same_side: Whether P at a point is on the assembly mode's side, with the arms as in a
-            configuration, for modes and lengths.
-        torques: Torques for a configuration, rates, their changes, gravity and inertia.
-        gather: Torques that balance a force at P.
-        masses: Upper triangle of M for a configuration, J and inertia.
+        modes: (machine) -> signs of the modes.
+        lengths: (columns, j) -> lengths of row j.
+        inertia: (columns, j) -> constants of the dynamics of row j.
+        posture: (point, modes, lengths) -> joint positions; whether they are real.
+        pose: (joint positions, modes, lengths) -> configuration; whether it is real; whether it is
+            in the working mode.
+        position: (configuration) -> point P.
+        regular: (configuration, lengths) -> whether J exists.
+        velocity: (configuration) -> rows of J.
+        same_side: (configuration, point, modes, lengths) -> whether the point is on the assembly
+            mode's side. Use only the arms of the configuration, since the rest may not be real.
+        torques: (configuration, rates, changes, gravity, inertia) -> torques.
+        gather: (configuration, force at P) -> torques J^T force.
+        masses: (configuration, J, inertia) -> upper triangle of M.
     """
 
     modes: Callable[..., Any]
@@ -63,12 +70,12 @@ class Equations(NamedTuple):
 
 
 def get(columns: FloatArray, first: int, j: int) -> Triple:
-    """Return three columns of a row."""
+    """Return the entries of row j in three columns, from ``first`` on."""
     return columns[first, j], columns[first + 1, j], columns[first + 2, j]
 
 
 def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) -> None:
-    """Set three columns of a row, to NaN if there is no solution."""
+    """Write row j of three columns, from ``first`` on; NaN if there is no solution."""
     columns[first, j] = values[0] if real else math.nan
     columns[first + 1, j] = values[1] if real else math.nan
     columns[first + 2, j] = values[2] if real else math.nan
@@ -77,7 +84,7 @@ def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) ->
 def _place(
     columns: FloatArray, j: int, position: Triple, rows: tuple[Triple, Triple, Triple], real: bool
 ) -> None:
-    """Set the first columns of a row to P and to the rows of J."""
+    """Write P and the rows of J to the first 12 columns of row j; NaN if not ``real``."""
     _put(columns, 0, j, position, real)
     _put(columns, 3, j, rows[0], real)
     _put(columns, 6, j, rows[1], real)
@@ -85,9 +92,10 @@ def _place(
 
 
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
-    """Fill the columns ``own`` with the machine parameters of the rows from ``start`` on.
+    """Fill the columns ``own`` with the machine parameters of ``count`` rows from ``start`` on.
 
-    Where all rows are of one machine, the first block's columns serve all.
+    Each machine has ``each`` rows. If all rows belong to one machine, only the first block fills
+    the columns, and all blocks use them.
     """
     if start == 0 or len(built) > 1:
         for j in range(count):
@@ -97,7 +105,7 @@ def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray)
 
 
 def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: int) -> None:
-    """Copy rows (count, 3) to the columns from ``first`` on."""
+    """Copy ``count`` of ``rows`` (n, 3), from ``start`` on, to three columns, from ``first`` on."""
     for j in range(count):
         columns[first, j] = rows[start + j, 0]
         columns[first + 1, j] = rows[start + j, 1]
@@ -105,7 +113,7 @@ def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: 
 
 
 def _write(columns: FloatArray, first: int, start: int, count: int, rows: Any) -> int:
-    """Copy columns to rows (m,), (m, 3) or (m, 3, 3); return the column after them."""
+    """Copy columns to ``rows``, (n,), (n, 3) or (n, 3, 3); return the next column's index."""
     if rows.ndim == 1:
         for j in range(count):
             rows[start + j] = columns[first, j]
@@ -124,7 +132,7 @@ compilable(get, _put, _place, _fill, _read, _write)
 
 
 class _Block(NamedTuple):
-    """Columns of a block: machine parameters, inputs and results; and what all rows share."""
+    """Columns of a block (machine parameters, inputs, results), and values that all rows share."""
 
     own: FloatArray
     given: FloatArray
@@ -154,7 +162,7 @@ def loops(name: str, few: int, many: int, equations: Equations) -> SimpleNamespa
 
 
 def _loop(row: Callable[..., None], modes_of: Callable[..., Any], size: int, width: int) -> Any:
-    """Return the loop over blocks that computes column j of ``width`` results by ``row``."""
+    """Return a loop over blocks; ``row`` computes the ``width`` results of each row j."""
     compilable(row)
 
     def loop(
@@ -179,7 +187,7 @@ def _loop(row: Callable[..., None], modes_of: Callable[..., Any], size: int, wid
 
 
 def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
-    """Return functions of row j of a block, which need the lengths alone: {function: results}."""
+    """Return functions that need only the lengths: {function: number of result columns}."""
     _, lengths, _, posture, pose, position_of, regular, velocity, on_side, *_ = equations
 
     def inverse(block: _Block, j: int) -> None:
@@ -193,7 +201,7 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         _put(block.found, 0, j, position_of(at), working)
 
     def evaluate(block: _Block, j: int) -> None:
-        """Compute P (3), J (9), 1/cond(J) and whether in the working mode, at joint positions."""
+        """Compute P (3), J (9), 1/cond(J), and whether the working mode holds, at theta."""
         g, found = lengths(block.own, j), block.found
         at, there, found[13, j] = pose(get(block.given, 0, j), block.modes, g)
         real, rows = there & regular(at, g), velocity(at)
@@ -201,7 +209,7 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         found[12, j] = conditioning(rows, NS) if real else math.nan
 
     def conditioning_at(block: _Block, j: int) -> None:
-        """Compute 1/cond(J) for P; 0 where P is off by the limit in the machine's modes."""
+        """Compute 1/cond(J) for P; 0 unless the machine's modes reach P within the limit."""
         g, point, limit = lengths(block.own, j), get(block.given, 0, j), block.limit
         angles, reached = posture(point, block.modes, g)
         at, there, _ = pose(angles, block.modes, g)
@@ -211,7 +219,7 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         block.found[0, j] = conditioning(velocity(at), NS) if known else 0.0
 
     def mode_left(block: _Block, j: int) -> None:
-        """Find the mode that is left at joint positions with P: 0, 1 assembly or 2 working."""
+        """Find the mode that the machine has left: 0 for none, 1 for assembly, 2 for working."""
         g, point = lengths(block.own, j), get(block.given, 3, j)
         at, there, working = pose(get(block.given, 0, j), block.modes, g)
         x, y, z = position_of(at)
@@ -221,9 +229,9 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         block.found[0, j] = (0.0 if working else 2.0) if same else 1.0
 
     def same_side(block: _Block, j: int) -> None:
-        """Find whether P is not beyond a parallel singularity.
+        """Find whether P is on the assembly mode's side of the parallel singularities.
 
-        Points out of reach are beyond a serial singularity instead.
+        The result is true for points out of reach: these are beyond a serial singularity.
         """
         g, point = lengths(block.own, j), get(block.given, 0, j)
         angles, real = posture(point, block.modes, g)
@@ -234,7 +242,7 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
 
 
 def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
-    """Return functions of row j of a block, which need all constants: {function: results}."""
+    """Return functions that need all constants: {function: number of result columns}."""
     _, lengths, inertia, _, pose, position_of, regular, velocity, _, torques, gather, masses = (
         equations
     )
@@ -249,7 +257,7 @@ def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
         _put(block.found, 0, j, (one - a, two - b, three - c), there & regular(at, g))
 
     def motion(block: _Block, j: int) -> None:
-        """Compute P (3), J (9), whether in the working mode, masses (9) and bias (3)."""
+        """Compute P (3), J (9), whether the working mode holds, masses (9) and bias (3)."""
         g, bodies, found = lengths(block.own, j), inertia(block.own, j), block.found
         at, there, found[12, j] = pose(get(block.given, 0, j), block.modes, g)
         real, rows = there & regular(at, g), velocity(at)

@@ -3,9 +3,10 @@
 A :class:`Machine` has forward and inverse kinematics, the Jacobian, modes, dynamics, regions, and
 the bodies to load. So other robots (a Delta, a gantry) serve the same tasks.
 
-Arrays have one robot a row and (x, y, z) or the three joints last, (..., 3), in SI units and the
-machine's own frame, which its :class:`~tpm_gym.mechanism.mount.Mount` places in the world. Joint
-positions theta are in rad (m for a slide). Results are NaN in rows without a solution.
+Arrays (..., 3) have one robot a row, and (x, y, z) or the three joints along the last axis.
+Everything is in SI units and in the machine's own frame; its
+:class:`~tpm_gym.mechanism.mount.Mount` places this frame in the world. Joint positions theta are in
+rad (m for a slide). Results are NaN in rows without a solution.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.mount import Mount
 
 MODES: Final = (None, "assembly", "working")
-"""Names of the numbers of :meth:`Machine.mode_left`."""
+"""Names of the modes that :meth:`Machine.mode_left` returns as 0, 1 and 2."""
 
 SAME_PLACE: Final = 1e-6
 """Largest distance between equal positions, m; far below the distance between assembly modes at a
@@ -173,7 +174,7 @@ class Machine(ABC):
         return theta
 
     def _postures(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.int8]]:
-        """Return joint positions (k, 3) at points (k, 3), and the mode that is left there (k,)."""
+        """Return joint positions (k, 3) at points (k, 3), and :meth:`mode_left` there, (k,)."""
         theta = self.require_inverse(points)
         return theta, self.mode_left(theta, points)
 
@@ -186,7 +187,8 @@ class Machine(ABC):
         Args:
             position: Point P (..., 3) m.
             built: Parameters (b, k) of b machines from :meth:`built`; None for the nominal machine.
-                Of m rows, row i is of machine ``built[i // (m // b)]``: (n, K, 3) goes with (n, k).
+                Of m rows, row i belongs to machine ``built[i // (m // b)]``; so points (n, K, 3) go
+                with parameters (n, k).
         """
 
     @abstractmethod
@@ -286,7 +288,7 @@ class Machine(ABC):
     # -- regions ----------------------------------------------------------------------------
 
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
-        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot be.
+        """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot go.
 
         Positions that the working mode reaches in another assembly mode give 0 too.
         """

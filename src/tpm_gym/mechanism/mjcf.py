@@ -50,12 +50,12 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
     Args:
         mechanism: Robot.
         mount: Mount of the robot.
-        time_step: Time step, s; the loops close within one.
+        time_step: Time step of the simulation, s. It sets the stiffness of closures and stops.
     """
     root = Element("mujoco", model=mechanism.name)
     add(root, "compiler", angle="radian", autolimits="true")
     defaults = add(root, "default")
-    # Within two time steps, critically damped: the shortest that MuJoCo allows.
+    # Stops act within two time steps, critically damped: the shortest time that MuJoCo allows.
     add(defaults, "joint", solreflimit=(2 * time_step, 1.0), solimplimit=STIFF)
     add(defaults, "equality", solref=(-1 / time_step**2, -1 / time_step), solimp=STIFF)
     drawn = add(defaults, "default", **{"class": "drawn"})
@@ -169,7 +169,7 @@ def _add_servos(root: Element, mechanism: Mechanism) -> None:
 
 
 def _add_home(root: Element, machine: Machine, joints: Iterable[str]) -> None:
-    """Add a key frame with P at home, all ``joints`` at rest and the motors' targets there."""
+    """Add the key frame ``home``: positions of all ``joints`` and targets of the motors there."""
     a, b, c = theta = machine.require_inverse(machine.home).tolist()
     at = machine.joint_positions((a, b, c))
     frames = add(root, "keyframe")

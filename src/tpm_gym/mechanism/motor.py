@@ -1,4 +1,4 @@
-"""Motors: consistent torque, size, inertia and speed.
+"""Motors whose torque, size, inertia and speed are consistent.
 
 A direct drive has no gear. Its torque follows from the magnetic shear stress sigma in the air gap,
 
@@ -21,7 +21,7 @@ from typing import Literal
 from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.bodies import ALUMINIUM, STEEL, Solid
 
-_FACE = 0.002  # m
+_FACE = 0.002  # m, by which each end of a housing is shorter than the shaft
 
 Axis = Literal["x", "y", "z"]
 
@@ -61,7 +61,7 @@ class Motor:
 
     @property
     def reach(self) -> float:
-        """Distance from the middle to the far end of each housing, m."""
+        """Distance from the middle of the motor to the far end of each half, m."""
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
     def rotor(self, axis: Axis) -> list[Solid]:
@@ -74,7 +74,7 @@ class Motor:
         ]
 
     def stator(self, axis: Axis, centre: Vector) -> list[Solid]:
-        """Build the housings along ``axis`` about ``centre``; the shaft ends in front of them."""
+        """Build the housings along ``axis`` about ``centre``; the shaft projects beyond them."""
         size = (self.stator_radius, self.reach - self.clearance - 2 * _FACE, 0.0)
         return [
             Solid("cylinder", size, at, ALUMINIUM, axis=axis, colour="dark")
@@ -82,7 +82,7 @@ class Motor:
         ]
 
     def halves(self, axis: Axis, centre: Vector = (0.0, 0.0, 0.0)) -> tuple[Vector, Vector]:
-        """Return the middles of both halves, m."""
+        """Return the centres of the motor's two halves, m."""
         away = (self.clearance + self.reach) / 2
         x, y, z = (away if name == axis else 0.0 for name in "xyz")
         u, v, w = centre
@@ -93,7 +93,7 @@ TORQUE_MOTOR = Motor(
     # Experts need at most 10 N m, and reversals at full speed 43 N m. So motors of half this
     # strength still follow. The shear stress is 44 kPa (peak) and 18 kPa (continuous).
     peak_torque=100.0,
-    continuous_torque=40.0,  # 100 W: 0.17 m^2 of housing, 60 K above the room
+    continuous_torque=40.0,  # loses 100 W: 0.17 m^2 of housing are 60 K warmer than the room
     motor_constant=4.0,
     no_load_speed=25.0,
     gap_radius=0.060,

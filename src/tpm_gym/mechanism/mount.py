@@ -54,7 +54,10 @@ class Mount:
 
     @cached_property
     def frame(self) -> tuple[FloatArray, FloatArray]:
-        """Factors and origin (3,), so that world = factors * point + origin, and back."""
+        """Factors and origin, (3,) each.
+
+        World = factors * point + origin, and point = factors * (world - origin).
+        """
         return _HALF_TURN, np.array([0.0, 0.0, self.height])
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Arms, rods and motors of which mechanisms are built: their sizes and materials."""
+"""Sizes and materials of the arms, rods and motors of mechanisms."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 CARBON_FIBRE = 1600.0  # kg/m^3
 SLIDES: Final = ("platform_x", "platform_y", "platform_z")
 TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-"""Joints of :func:`free_platform`; their positions are P (m) and 0 (rad)."""
+"""Joints of :func:`free_platform`: slides, whose positions are P (m), and turns, always 0 rad."""
 FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 
 _AXES: Final[tuple[Vector, ...]] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-_SPECK = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, far below what a torque shows
+_SPECK = 0.005  # m, edge of a cube of 1 kg/m^3: 1e-7 kg, too light to change torques
 
-# Largest angles of an arm from level outwards, towards the base and towards the platform.
+# Largest angles, rad, by which an arm can turn from pointing level outwards: towards the base, and
+# towards the platform.
 ARM_RAISED, ARM_LOWERED = np.deg2rad(75.0), np.deg2rad(115.0)
 
 
@@ -32,7 +33,7 @@ def displaced(axis: str, value: float, centre: Vector = (0.0, 0.0, 0.0)) -> Vect
 
 
 def tube(axis: Literal["x", "y"], length: float, height: float, width: float, wall: float) -> Solid:
-    """Build a rectangular aluminium tube from the link's origin along ``axis``."""
+    """Build a rectangular aluminium tube from the link's origin along ``axis``; sizes in m."""
     outer = (length, width, height) if axis == "x" else (width, length, height)
     inner, low = width - 2 * wall, height - 2 * wall
     bore = (length, inner, low) if axis == "x" else (inner, length, low)
@@ -70,7 +71,11 @@ def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
 def motor(
     name: str, axis: Vector, origin: Vector, level: float, sense: int, rpy: Vector = LEVEL
 ) -> Joint:
-    """Build a motor. At theta = ``level`` its arm points outwards; ``sense`` of theta lowers it."""
+    """Build the joint of a motor.
+
+    Its arm points outwards at theta = ``level``. ``sense`` (1 or -1) is the direction of theta in
+    which the arm turns towards the platform.
+    """
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
     line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed
     return Joint(name, "revolute", "base", origin, axis, lower, upper, *line, rpy)
@@ -84,7 +89,7 @@ def saddles(axis: Literal["x", "y"], centre: Vector) -> list[Solid]:
 
 
 def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
-    """Build an actuated arm: motor's shaft and rotor, rectangular tube, elbow bar across."""
+    """Build an arm: the motor's shaft and rotor, a rectangular tube, and a bar across the elbow."""
     shaft = bar(across, TORQUE_MOTOR.reach, 0.022, density=STEEL)
     return (
         shaft,
@@ -97,9 +102,9 @@ def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tu
 def free_platform(solids: tuple[Solid, ...], reach: float) -> list[Link]:
     """Build a platform with its origin at P that belongs to no leg.
 
-    Three slides and three revolutes, with next to no mass between them, leave it free. So every leg
-    can end in loop closures, and none is within one branch of the tree, as PyBullet's direct solver
-    needs it.
+    Three slides and three revolutes, with almost no mass between them, let it move freely. So every
+    leg can end in loop closures, and every closure connects two branches of the tree. PyBullet's
+    direct solver needs this.
 
     Args:
         solids: Solids of the platform.

@@ -43,10 +43,11 @@ COLOURS = {
 }
 
 _END: Final = 0.002
-"""Height of the ends of a cylinder that are collision shapes of their own, m.
+"""Height of each end of a cylinder, m; the ends are separate collision shapes.
 
-PyBullet finds one new contact of two shapes in a time step, anywhere on the height of an upright
-cylinder that hits a wall. So a lip that hit a block low could strike it at its upper edge.
+PyBullet finds one new contact of two shapes in a time step. If an upright cylinder hits a wall, the
+contact can be anywhere on its height. So a cup whose lip hits a block could get its contact far
+above the lip.
 """
 
 _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}
@@ -140,7 +141,7 @@ def _add_link(root: Element, link: Link) -> None:
 
 
 def _collision_shapes(solid: Solid) -> list[Solid]:
-    """Return a box as it is, a cylinder as three: its ends, and the flank between them."""
+    """Return a box as it is, and a cylinder as three: its ends, and the part between them."""
     radius, length, _ = solid.size
     if solid.kind == "box" or length <= 2 * _END:
         return [solid]
@@ -167,7 +168,7 @@ def _rpy(solid: Solid) -> Vector:
     """Return roll, pitch and yaw of a box, or of a cylinder along z, in its link, rad."""
     turn = solid.rotation
     pitch = math.asin(max(-1.0, min(1.0, -turn[2, 0])))
-    if abs(turn[2, 0]) > 1 - 1e-12:  # roll and yaw turn about one axis: let yaw do it
+    if abs(turn[2, 0]) > 1 - 1e-12:  # roll and yaw turn about one axis: roll is set to 0
         return 0.0, pitch, math.atan2(-turn[0, 1], turn[1, 1])
     return math.atan2(turn[2, 1], turn[2, 2]), pitch, math.atan2(turn[1, 0], turn[0, 0])
 

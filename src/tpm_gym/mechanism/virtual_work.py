@@ -1,12 +1,13 @@
-"""Motor torques of any machine, from its bodies and joint positions alone, by differences.
+"""Motor torques of any machine by finite differences, from its bodies and joint positions alone.
 
-Tests compare closed forms with it, and machines without a closed form use it. Its relative error is
-about 1e-6, and 2e-4 next to a parallel singularity. It takes milliseconds, as it computes the
-places of all bodies nine times.
+Tests compare closed forms with these torques, and machines without a closed form use them. The
+relative error is about 1e-6, and 2e-4 next to a parallel singularity. A call takes milliseconds, as
+it computes the places of all bodies nine times.
 
-A rigid body with its centre of mass at x and rotation R has F = [R | x] (3, 4) and the kinetic
-energy T = trace(F' H F'^T) / 2, where H (4, 4) has the second moments of its mass in one block and
-its mass in the other. So the torques are traces of dF/dtheta H F''^T, without angular velocities.
+The place of a rigid body is F = [R | x] (3, 4), with its rotation R and its centre of mass x. Its
+kinetic energy is T = trace(F' H F'^T) / 2, where F' is the derivative by time. H (4, 4) has two
+diagonal blocks: the second moments of the mass (3, 3), and the mass. So the torques are sums of
+trace(dF/dtheta H F''^T) over the bodies, without angular velocities.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ def torque(
         joint_positions: Function from the motors' positions to all joint positions.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
         link_masses: Factors of mass and inertia of the moving links.
-        theta: Positions of the motors (3,), rad or m; and their derivatives by time.
-        theta_dot: Velocities (3,).
-        theta_ddot: Accelerations (3,).
+        theta: Positions of the motors (3,), rad or m.
+        theta_dot: Velocities of the motors (3,), per s.
+        theta_ddot: Accelerations of the motors (3,), per s^2.
     """
 
     def frames(motors: FloatArray) -> FloatArray:

@@ -47,7 +47,7 @@ class _Entries(BaseModel):
 
 
 class Box(_Entries):
-    """Bounded space of arrays; ``low`` and ``high`` are flat, by rows."""
+    """Bounded space of arrays; ``low`` and ``high`` are flat, in row-major order."""
 
     shape: tuple[_Size, ...]
     dtype: Literal["float32", "float64"]
@@ -104,13 +104,13 @@ class Description(_Entries):
     """Everything about a policy except its weights.
 
     ``env_options`` are machine, engine, drive and shield of the training if they differ from the
-    id's. ``seed`` is None if it is not known, a version if the package was not installed.
+    id's. ``seed`` is None if it is not known. A version is None if the package was not installed.
     """
 
     format: Literal["tpm_gym.policy"]
     version: Literal[1]
     env_id: _Name = Field(alias="env")
-    env_options: dict[Literal["machine", "engine", "drive", "shield"], _Name | bool] = {}
+    env_options: dict[Literal["machine", "engine", "drive", "shield"], _Name | bool | float] = {}
     algorithm: _Name
     seed: _Count | None
     steps: _Count
@@ -173,7 +173,7 @@ def files(path: str | Path) -> tuple[Path, Path]:
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256, in hex, of all entries but ``sha256``; their layout does not matter."""
+    """Return the SHA-256, in hex, of all entries but ``sha256``; order and layout do not count."""
     entries = {name: value for name, value in content.items() if name != "sha256"}
     text = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()

@@ -21,7 +21,7 @@ _BLOCK = 8
 """Rows of a batch that are multiplied at once.
 
 OpenBLAS uses no threads for so few rows. So an action has the same bits alone and in a batch, and
-threads do not slow each other down on a busy machine.
+threads do not slow each other down on a busy computer.
 """
 
 
@@ -29,13 +29,13 @@ def load_policy(path: str | Path) -> Policy:
     """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. If neither
-            does, also the id of an environment with a published policy, a str such as
-            ``"TPMPickAndPlace-v0"``.
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. Or the id of
+            an environment with a published policy, such as ``"TPMPickAndPlace-v0"``, if neither
+            file exists.
 
     Raises:
         InputError: ``path`` is neither a str nor a Path, or empty.
-        PolicyFileError: A file is missing or no policy file, or ``path`` is an archive of
+        PolicyFileError: A file is missing or is not that of a policy, or ``path`` is an archive of
             Stable-Baselines3, which only unpickling could read.
         MissingPackageError: safetensors or pydantic is not installed.
     """
@@ -168,11 +168,12 @@ class Policy:
 
 
 def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tuple[int, ...]]:
-    """Return an entry of an observation as (n, size), in float32 precision; and its batch axes."""
+    """Return an entry of an observation as (n, size), rounded to float32, and its batch shape."""
     values = numbers(name, value)
     batch = values.shape[: values.ndim - len(shape)]
     if values.shape != batch + shape or len(batch) > 1:
-        raise InputError(name, values.shape, f"of shape {shape} or (n, *{shape}), by shape")
+        many = ", ".join(map(str, ("n", *shape)))
+        raise InputError(f"shape of {name}", values.shape, f"{shape} or ({many})")
     with np.errstate(over="ignore"):
         rows = values.reshape(-1, math.prod(shape)).astype(np.float32).astype(np.float64)
     if not np.isfinite(rows).all():
@@ -184,7 +185,7 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
 def _control(env: Any) -> str | None:
     """Return the name of an environment's control; None if it is not of tpm_gym."""
     own = getattr(env, "unwrapped", env)
-    # Gymnasium's SyncVectorEnv has a list of environments, and no method that is safe to ask.
+    # Gymnasium's SyncVectorEnv has a list of environments, and no method that is safe to call here.
     first = next(iter(getattr(own, "envs", [])), own)
     control = getattr(getattr(first, "unwrapped", first), "control", None)
     if hasattr(env, "has_attr") and env.has_attr("control"):

@@ -38,7 +38,15 @@ def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
 def shifted(
     points: FloatArray, parts: FloatArray, step: FloatArray, low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return points (m, 3) moved by ``parts`` (m, 3) of a step (3,), and projected into a box."""
+    """Return points + parts * step, projected into the box from ``low`` to ``high``.
+
+    Args:
+        points: (m, 3).
+        parts: (m, 3).
+        step: (3,).
+        low: (3,).
+        high: (3,).
+    """
     moved = np.empty_like(points)
     for row in range(len(points)):
         for axis in range(3):
@@ -159,7 +167,8 @@ def measured(
 
     Returns:
         (n, 9 + 12 k): position, velocity, command minus position; then for each object its centre,
-        its top minus the lip, its velocity, x and y of its z axis, and its share of the vacuum.
+        its top minus the lip, its velocity, x and y of its z axis, and vacuum / most if it is held,
+        else 0.
     """
     values = np.empty((len(position), 9 + 12 * len(halves)))
     for row in range(len(position)):
@@ -239,7 +248,8 @@ def truth(
     """Compute the largest loop gap (m), point P (m, world) and the platform's tilt (rad).
 
     Args:
-        frames: (7 l,) origin (m) and orientation (x, y, z, w) of each of l links, world.
+        frames: (7 l,) seven numbers for each of l links, world frame: origin (m), orientation
+            (x, y, z, w).
         sides: (c, 2) indices of the two links of each closure.
         pivots: (c, 2, 3) m, points of each closure, in the frames of its links.
         platform: Index of the platform's link.
@@ -271,22 +281,24 @@ def friction_force(
 ) -> tuple[Vector, Vector]:
     """Compute Coulomb's friction on a block for the next time step, from the slip in the last.
 
-    The force ends the slip within a few time steps. A sticking contact needs a force without slip.
-    It is the sum of earlier forces.
+    The force has two parts. The first part would end the slip in one time step. The second part
+    holds a block that sticks, at which there is no slip: each time step adds half of the first part
+    to it.
 
     Args:
         point: Point of contact, m.
         normal: Unit vector towards the block.
         place: Centre of the block, m.
-        motion: Velocity (m/s) and angular velocity (rad/s) of the block, velocity of the other.
-        before: Sum of earlier forces, N.
-        most: Largest friction, N; none if negative.
+        motion: Velocity (m/s) and angular velocity (rad/s) of the block, and velocity (m/s) of the
+            other body.
+        before: Second part of the force in the last time step, N.
+        most: Largest friction, N; a negative value is taken as 0.
         mass: Mass of the block, kg.
         moments: Principal moments of inertia of the block, which is assumed upright, kg m^2.
         step: Time step, s.
 
     Returns:
-        The friction on the block, and the sum of earlier forces then, N.
+        The friction on the block, and its second part, N.
     """
     arm = plus(point, place, -1.0)
     slip = plus(plus(motion[0], cross(motion[1], arm)), motion[2], -1.0)
@@ -302,7 +314,7 @@ def friction_force(
 
 @compiled
 def _at_most(vector: Vector, most: float) -> Vector:
-    """Return a vector, shortened to a length; zero for a negative length."""
+    """Shorten a vector to the length ``most`` if it is longer; negative is taken as 0."""
     share = min(1.0, max(most, 0.0) / max(length(vector), 1e-12))
     return plus((0.0, 0.0, 0.0), vector, share)
 
@@ -333,13 +345,13 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
 
 @kept
 def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray:
-    """Return points (r, k, d, 3) in boxes, from random numbers.
+    """Return d candidates for each of k points of r environments, (r, k, d, 3), in boxes.
 
     Args:
-        shares: (r, k, d, 4) numbers in [0, 1): the place in the box, and which box. All d points
-            are in the box of the first.
-        boxes: (b, 2, 3) low and high corners; those of the first of k points come first.
-        counts: (k,) number of boxes of each of the k points.
+        shares: (r, k, d, 4) random numbers in [0, 1). The first three are the place in a box. The
+            fourth chooses the box; all d candidates are in the box that the first one chooses.
+        boxes: (b, 2, 3) low and high corners: all boxes of the first point, then of the second.
+        counts: (k,) number of boxes of each point.
     """
     points = np.empty((*shares.shape[:3], 3))
     for row in range(len(shares)):
@@ -370,8 +382,8 @@ def accepted(
         drawn: (r, k, d, 3) m, draws for the last k points of each row.
         conditioning: (r, k, d), at the draws.
         least: Smallest conditioning.
-        most: Conditioning above all that are accepted.
-        apart: Smallest distance from all points before, m.
+        most: Bound of the conditioning; accepted draws are below it.
+        apart: Smallest distance from the points before, m.
         rows: (r,) rows of ``points``.
         points: (n, j, 3) m; output.
 
@@ -411,7 +423,7 @@ def arrived(
 
     Returns:
         P one time step before the end, and at the end (n, 3) m; joint positions (n, 3) rad and
-        velocities (n, 3) rad/s; force on P as if the held objects had no inertia (n, 3) N.
+        velocities (n, 3) rad/s; force on P without the inertial force of held objects (n, 3) N.
     """
     shape, last, now = (len(theta), 3), theta.shape[1] - 1, points.shape[1] - 1
     before, position, force = np.empty(shape), np.empty(shape), np.empty(shape)
@@ -431,6 +443,9 @@ def arrived(
 @kept
 def differences(theta: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return joint positions, velocities and accelerations (n, k, 3) in k time steps.
+
+    The positions are at the beginning of each time step. The velocities are the mean velocities of
+    the time step before.
 
     Args:
         theta: (n, k + 2, 3) rad, at the ends of time steps.
@@ -502,7 +517,7 @@ def along(
         references: Output.
     """
     steps = len(references.theta)
-    for k in range(steps):  # outermost, because references are written along rows
+    for k in range(steps):  # outermost loop, so that the arrays are written in their order
         share = k / max(steps - 1, 1)
         for row in range(len(theta)):
             for i in range(3):

@@ -28,7 +28,7 @@ from tpm_gym.simulation.vacuum import Hold
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SPRING_GAIN = 0.2
-"""Fraction of its displacement that the cup's spring removes in one time step."""
+"""Fraction of the cup's displacement that its spring removes in one time step."""
 _START = np.array([[0.5, 0.5, 0.0]])  # weights of the commands at the beginning of a period
 
 
@@ -135,17 +135,19 @@ class Readout(NamedTuple):
 
 
 def spline_weights(steps: int) -> FloatArray:
-    """Return weights (steps, 3) of three commands, oldest first, for a quadratic B-spline."""
+    """Return weights (steps, 3) of the last three commands, oldest first, after each time step."""
     s = np.arange(1, steps + 1) / steps
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
 
 
 class Path:
-    """Path of point P of n robots in a control period: a quadratic B-spline through the commands.
+    """Path of point P of n robots in a control period: a quadratic B-spline.
 
-    The spline lags the commands by half a period, stays in their convex hull, and keeps the
-    accelerations finite. Point P is interpolated, not the joint positions: near a singularity,
-    interpolated joint positions would move P away from the line by centimetres.
+    Its control points are the last three commands. So the path lags the commands by half a period,
+    stays in their convex hull, and has finite accelerations.
+
+    Point P is interpolated, not the joint positions: near a singularity, interpolated joint
+    positions would move P away from the line by centimetres.
 
     Args:
         machine: Nominal machine, used for the inverse kinematics.
@@ -167,6 +169,11 @@ class Path:
         """Store the arguments."""
         self.machine, self.commands, self.weights, self._bias = machine, commands, weights, bias
 
+    def take(self, rows: IntArray) -> Path:
+        """Return the paths of some robots."""
+        bias = None if self._bias is None else self._bias[rows]
+        return Path(self.machine, self.commands[rows], self.weights, bias)
+
     def points(self, last: int = 0) -> FloatArray:
         """Return point P (n, k, 3) m at the ends of the last k time steps (0: all time steps)."""
         points: FloatArray = loops().spline_points(self.commands, self.weights[-last:])
@@ -184,7 +191,7 @@ class Path:
     def _readings(self, weights: FloatArray) -> FloatArray:
         points: FloatArray = loops().spline_points(self.commands, weights)
         theta = self.machine.inverse(points)
-        # all_within() is also False for NaN, and reach() then raises the error.
+        # NaN means out of reach; all_within() is False for it. reach() raises the error.
         if not loops().all_within(theta.reshape(-1, 3), *self.machine.stops):
             theta = self.machine.reach(points)
         return theta
@@ -275,14 +282,14 @@ class Engine(Protocol):
         """
 
     def set_belt(self, rows: IntArray, speed: FloatArray) -> None:
-        """Set the speeds (r,) m/s of the belts of ``rows``; the scene has a belt.
+        """Set the speeds (r,) m/s of the belts of ``rows``; called only for scenes with a belt.
 
-        The contacts of the belt's surface have this velocity along x, and the belt stays in place.
-        The speed is no part of ``save``.
+        In contacts, the belt's surface moves at this speed along x. The belt stays in place.
+        ``save`` does not include the speed.
         """
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
-        """Simulate one control period along ``path``; ``vacuum`` (n,) is True where it is on."""
+        """Simulate one control period along ``path``; ``vacuum`` (n,): whether the vacuum is on."""
 
     def read(self) -> Readout:
         """Return the readings of all robots; the caller may change the arrays."""
@@ -294,12 +301,12 @@ class Engine(Protocol):
         """
 
     def restore(self, saved: Any) -> None:
-        """Continue from the result of ``save``; number of robots and plants must be equal."""
+        """Continue from a result of ``save``; robots and plants are the same as at ``save``."""
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Update the window: its camera, the first robot, and the goal markers, (k, 3) m.
 
-        An engine whose constructor has no keyword ``gui`` is never asked to.
+        This method is not called if the engine's constructor has no keyword ``gui``.
         """
 
     def picture(self, row: int, view: View) -> Picture:
@@ -327,7 +334,7 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
         engine: Callable that creates the engine, or ``"module:attribute"``, which is imported at
             the first use. The callable may have the keywords ``gui`` (open a window),
             ``renderer``, ``physics`` (numerical settings) and ``drive`` (a
-            :class:`~tpm_gym.simulation.Servo`). Leave out the keywords that it does not support.
+            :class:`~tpm_gym.simulation.Servo`). Omit each option that the engine does not support.
         robots: Largest number of robots in one engine; None for no limit.
 
     Raises:
@@ -345,7 +352,7 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
 
 
 def _path(engine: str | Factory) -> str:
-    """Return "module:attribute" of an engine; an equal path may be registered again."""
+    """Return "module:attribute" of an engine; it shows whether two registrations are equal."""
     if isinstance(engine, str):
         return engine
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"

@@ -109,7 +109,8 @@ def camera_of(value: Any, machine: Machine) -> Camera:
     if isinstance(value, str) and value in CAMERAS:
         return _named(value, machine)
     if value is None or isinstance(value, str):
-        valid = f"{', '.join(map(repr, CAMERAS))}, or a tpm_gym.simulation.Camera"
+        names = ", ".join(map(repr, CAMERAS))
+        valid = f"{names}, a tpm_gym.simulation.Camera, or a mapping with its attributes"
         raise ConfigurationError("camera", value, valid)
     try:
         return settings_of(Camera, "camera", value)
@@ -133,7 +134,7 @@ def _named(name: str, machine: Machine) -> Camera:
 
 
 class View(NamedTuple):
-    """Picture that an engine shall draw.
+    """Request for a picture.
 
     Attributes:
         camera: Camera, in the world frame.

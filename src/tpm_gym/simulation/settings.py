@@ -38,7 +38,7 @@ class Numerics:
         time_step: Time step, s; the control period must be an integer multiple of it.
 
     Raises:
-        ConfigurationError: If the time step is too short, or no number.
+        ConfigurationError: If the time step is too short, or is not a number.
     """
 
     time_step: float = 1 / 250
@@ -52,10 +52,10 @@ class Numerics:
 
 
 def count_steps(control_period: float, time_step: float, least: int = 1) -> int:
-    """Return the number of time steps (s) in a control period (s).
+    """Return the number of time steps in a control period; both are given in s.
 
     Raises:
-        ConfigurationError: If it is no whole number, or below ``least``.
+        ConfigurationError: If the number is not whole, or is below ``least``.
     """
     steps = control_period / time_step
     if round(steps) < least or abs(steps - round(steps)) >= 1e-6:

@@ -30,11 +30,11 @@ from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 CLOSURE_LIMIT = 0.005
 """Largest allowed gap at a loop closure, m."""
 
-_STEPS = 10  # time steps in a control period, if neither settings nor engine say
+_STEPS = 10  # time steps in a control period other than 40 ms, if the settings have none
 
 _BLUR = 0.05
-"""Distance from a plane that the machine may pass, in step limits, at which the observed velocity
-normal to the plane is half of J theta_dot."""
+"""Distance from the plane of ``mirror_axis``, as a fraction of the machine's step limit, at which
+the observed velocity normal to the plane is half of J theta_dot."""
 
 _COLUMNS = (
     *("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias"),
@@ -70,7 +70,7 @@ class Simulation:
         count: Number of robots, n.
         control_period: Time between two commands, s.
         physics: Numerical settings of the engine; None for the engine's defaults. A control period
-            other than 40 ms has ten time steps if the settings do not say.
+            other than 40 ms has ten time steps, unless the settings have a time step.
         drive: Servo drives of the motors; None for ideal drives.
         gui: Whether to open a window.
         renderer: Renderer of the pictures; None for the engine's default.
@@ -190,9 +190,10 @@ class Simulation:
         self._bias[rows], self._mode_left[rows] = bias, 0
         self._noise[rows] = 0.0 if noise is None else noise[:, None]
         self._disturbed = bool(self._bias.any() or self._noise.any())
-        if self._disturbed:  # then the first reading may have no assembly
+        if self._disturbed:
+            # state() uses these values if no assembly exists at the first reading. The machine may
+            # own the old arrays, so they are copied before they are changed.
             columns = self._position, self._jacobian, self._conditioning
-            # The machine may own these arrays, so they are copied before they are changed.
             self._position, self._jacobian, self._conditioning = map(np.copy, columns)
             self._position[rows], self._jacobian[rows] = reading.position, reading.jacobian
             self._conditioning[rows] = reading.conditioning
@@ -241,12 +242,13 @@ class Simulation:
         """
         self.state()
         if not self.loops.all_within(commands, *self._region):
-            # The spline ends before the command, so that the path may not raise the error.
+            # The path ends halfway between the last two commands, so the engine would accept some
+            # commands that are out of reach.
             self.machine.reach(commands)
         self._commands[:, 2] = commands
         bias = self._bias if self._disturbed else None
         self.engine.advance(Path(self.machine, self._commands, self._weights, bias), vacuum)
-        # In turn, because numpy copies what overlaps
+        # Two assignments: numpy would copy overlapping slices, which takes longer.
         self._commands[:, 0] = self._commands[:, 1]
         self._commands[:, 1] = commands
         if self._disturbed or noise is not None:
@@ -262,7 +264,7 @@ class Simulation:
         return self._mode_left
 
     def state(self) -> State:
-        """Return the state of all robots; after a move or reset, read the engine once.
+        """Return the state of all robots. The engine is read once after each move or reset.
 
         Raises:
             ClosureError: If a loop has opened.
@@ -321,17 +323,17 @@ class Simulation:
     def _mirrored(
         self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the plane that the machine may pass.
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots that are beyond the plane of ``mirror_axis``.
 
-        Encoders do not show the side, because joint positions are equal on both sides. It is the
-        sign of a passive joint, which a switch would measure on a real robot.
+        Joint positions are equal on both sides of the plane, so encoders do not show the side. The
+        sign of a passive joint shows it. A switch would measure this sign on a real robot.
 
-        Where P did not follow its path through the plane, the commands are mirrored too, which does
-        not change the joint positions on the path.
+        If P did not follow its path through the plane, the commands are mirrored too. This does not
+        change the joint positions on the path.
 
         Args:
             truth: (n, 3) m, P of the platform, world.
-            rates: (n, 3) rad/s, of the encoders.
+            rates: (n, 3) rad/s, joint velocities as the encoders report them.
             position: P by forward kinematics in the machine's assembly mode.
             jacobian: J at ``position``.
         """
@@ -341,13 +343,14 @@ class Simulation:
         sign = np.where(there * machine.home[axis] < 0, -1.0, 1.0)
         position, jacobian = position.copy(), jacobian.copy()
         position[:, axis] *= sign
-        # In the plane, encoders do not show the velocity normal to it: J is infinite. So damp it.
+        # In the plane, J is infinite, and encoders do not show the velocity normal to the plane. So
+        # the observed velocity falls to zero there.
         distance, blur = position[:, axis], _BLUR * limit
         jacobian[:, axis] *= (sign * distance**2 / (distance**2 + blur**2))[:, None]
-        # Next to the plane, J theta_dot has no bound. So bound it by twice the fastest command.
+        # Next to the plane, J theta_dot has no bound. So clip it to twice the fastest command.
         speed, most = np.abs((jacobian[:, axis] * rates).sum(axis=1)), 2 * limit / CONTROL_PERIOD
         jacobian[:, axis] *= (most / np.maximum(speed, most))[:, None]
-        reached = self.recent[:, :, axis].mean(axis=1)  # by the path
+        reached = self.recent[:, :, axis].mean(axis=1)  # end of the path
         turned = (there * reached < 0) & (np.abs(reached) > limit)
         self._commands[turned, :, axis] *= -1.0
         return position, jacobian
@@ -380,8 +383,8 @@ class Simulation:
         """Draw a robot and its scene.
 
         Args:
-            view: Camera, size, and whether the ids of bodies are wanted.
-            markers: (k, 3) m, world, goal markers. They have colours, no depth and no id.
+            view: Camera, size, and whether the picture includes the ids of bodies.
+            markers: (k, 3) m, world, goal markers. They change the colours, but not depth and ids.
             row: Robot.
         """
         camera = view.camera.following(self.state().platform_position[row])
@@ -392,7 +395,7 @@ class Simulation:
         return picture
 
     def _casters(self, row: int) -> list[list[float]]:
-        """Return position and radius of the cup and the objects, (k, 4) m."""
+        """Return position and radius of all bodies with a shadow, cup and objects, (k, 4) m."""
         now = self.state()
         x, y, z = now.platform_position[row].tolist()
         widths = [block.width / 2 for block in self.scene.objects]

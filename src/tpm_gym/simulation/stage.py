@@ -44,7 +44,7 @@ LIGHT: Final[Vector] = (1.0, -1.2, 2.5)
 """Direction from the scene to the light."""
 
 PATCH_HEIGHT: Final = 5e-4
-"""Half the thickness of painted rectangles, m, whose middle is at the table top."""
+"""Half the thickness of painted rectangles, m. Their centres are at the table top."""
 _ARROW: Final[Colour] = (0.95, 0.75, 0.15, 1.0)
 _ARROWS_APART, _ARROW_LENGTH, _ARROW_HALF_WIDTH, _SLICES = 0.2, 0.05, 0.04, 10  # m, m, m, count
 

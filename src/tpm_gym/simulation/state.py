@@ -19,8 +19,8 @@ _LIGHTEST, _HEAVIEST, _ROUGHEST = 1e-6, 1e6, 1e6  # of blocks, kg, and their lar
 class Block:
     """Box with a square base, the object of a task.
 
-    Engines compute all four corner contacts of a box in one time step. A cylinder would get only
-    one to three contact points, and its rim would sink into the table beside them.
+    Objects are boxes because engines find all four contacts of a box with the table in one time
+    step. For a cylinder, they find only one to three, and the rest of its rim sinks into the table.
 
     Attributes:
         name: Key in ``reset(options=...)``; unique in its scene.
@@ -76,8 +76,8 @@ class Block:
 class Belt:
     """Conveyor belt: a part of the table, over its full width, whose surface moves along x.
 
-    It begins at or beyond the table's lower edge in x. The rest of the table stands still. A
-    positive speed moves objects towards +x.
+    ``start`` is at or beyond the edge of the table on the side of -x. The rest of the table stands
+    still. A positive speed moves objects towards +x.
 
     Attributes:
         start: Lowest x, m, world.
@@ -102,7 +102,7 @@ class Belt:
     def require(
         self, speeds: Any, count: int, error: type[ConfigurationError | InputError]
     ) -> FloatArray:
-        """Check speeds (count,) m/s of this belt, and return them; raise ``error`` otherwise."""
+        """Check and return speeds (count,) m/s of belts; raise ``error`` if one is invalid."""
         found = finite("belt_speed", speeds, (count,), error)
         if (abs(found) > self.fastest).any():
             raise error("belt_speed", found.tolist(), f"at most {self.fastest} m/s either way")
@@ -111,7 +111,7 @@ class Belt:
 
 @dataclass(frozen=True)
 class Patch:
-    """Painted rectangle on the table. It is drawn, and nothing touches it.
+    """Painted rectangle on the table. It is drawn, but has no contacts.
 
     Attributes:
         low: Lowest x and y, m, world.
@@ -227,7 +227,7 @@ class State:
     belt_speed: FloatArray
 
     def take(self, rows: Any) -> State:
-        """Return the State of some rows; for an integer, of one robot without the axis n."""
+        """Return the State of some rows; an integer gives one robot, without the axis n."""
         return State(**{name: values[rows] for name, values in vars(self).items()})
 
     @property

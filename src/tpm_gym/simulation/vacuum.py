@@ -14,7 +14,11 @@ from typing import Any, NamedTuple
 from tpm_gym.mechanism.cup import CUP
 
 CLEARANCE = 2e-5
-"""Gap between lip and held object, m. Without a gap, their contact would act against the weld."""
+"""Gap between lip and held object, m.
+
+PyBullet and MuJoCo fix the held object to the cup by a weld. Without a gap, the contact between lip
+and object would push against the weld.
+"""
 
 
 class Hold(NamedTuple):
@@ -53,8 +57,8 @@ def pressure_after(vacuum: float, time_step: float, pumped: bool) -> float:
 def holds(vacuum: Any, load: tuple[Any, Any]) -> Any:
     """Return whether a vacuum (Pa) can carry a load (tension and shear, N); floats or arrays.
 
-    The norm of pull and shear must not exceed vacuum times area. Where cup and object are pressed
-    together, the pull is zero, and lip friction reduces the shear.
+    The norm of pull and shear must not exceed vacuum times area. If cup and object are pressed
+    together, the pull is zero, and lip friction carries a part of the shear.
     """
     tension, shear = load
     pull = (tension > 0) * tension

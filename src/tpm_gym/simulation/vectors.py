@@ -45,7 +45,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def onto(start: Vector, matrices: Any, row: int, a: Vector, sign: float = 1.0) -> Vector:
-    """Return start + sign * matrices[row] a, summed from left to right; matrices is (n, 3, 3)."""
+    """Return start plus sign times the product of matrices[row], (3, 3), and the vector a."""
     x, y, z = a[0] * sign, a[1] * sign, a[2] * sign
     m = matrices
     return (
@@ -56,7 +56,7 @@ def onto(start: Vector, matrices: Any, row: int, a: Vector, sign: float = 1.0) -
 
 
 def row_of(values: Any, row: int) -> Vector:
-    """Return a row of an array (n, 3); faster than :func:`three` with a view."""
+    """Return row ``row`` of an array (n, 3), faster than ``three(values[row])``."""
     return values[row, 0], values[row, 1], values[row, 2]
 
 

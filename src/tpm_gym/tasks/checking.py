@@ -1,4 +1,4 @@
-"""Check of a task: it starts, with equal results for states together and one by one."""
+"""Check of a task: it can start, and computes equal results for states in a batch and alone."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tpm_gym.arrays import finite
+from tpm_gym.arrays import brief, finite
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
@@ -18,20 +18,24 @@ __all__ = ["check"]
 
 _EXAMPLES = 7
 """States with which a task is checked; no other size is 7, so that axes cannot be confused."""
+_OWN_ROW = (
+    "equal results for equal states: from the robot's own row (reduce by axis=-1), and in every "
+    "call (store nothing in the task)"
+)
 
 
 def check(task: Task, taken: Sequence[str] = ()) -> None:
-    """Check that a task has starts, and equal results for states together and one by one.
+    """Check that a task can start, and computes equal results for states in a batch and alone.
 
-    Not every machine has tempting goals, or room for a task. And a method that reduces over the
-    robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns, gives wrong
-    rewards in vector environments without an error.
+    A task cannot start if the machine has no tempting goals, or no room for the task. A method that
+    reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns,
+    gives wrong rewards in vector environments without an error.
 
     Args:
         taken: Names that no event may have.
 
     Raises:
-        ConfigurationError: If there is no start, an attribute is not possible, an event's name is
+        ConfigurationError: If the task cannot start, an attribute is not valid, an event's name is
             taken, or a result is wrong; the error names the attribute or the method.
     """
     known = list(taken)
@@ -50,8 +54,12 @@ def check(task: Task, taken: Sequence[str] = ()) -> None:
     for row in (0, _EXAMPLES - 1):
         alone = _results(task, several.take([row]))
         for name, values in together.items():
-            if np.shape(values)[:1] != (_EXAMPLES,) or not _equal(values[row], alone.get(name)):
+            shape, single = np.shape(values), alone.get(name, ())
+            if shape[:1] != (_EXAMPLES,) or np.shape(single) != (1, *shape[1:]):
                 raise _wrong_rows(name, values, "(n, ...)")
+            if not np.allclose(values[row], single[0], equal_nan=True):
+                found = f"{brief(values[row])} among {_EXAMPLES} robots, {brief(single[0])} alone"
+                raise ConfigurationError(name, found, _OWN_ROW)
 
 
 def _results(task: Task, state: State) -> dict[str, Any]:
@@ -104,11 +112,6 @@ def _require_shape(name: str, values: Any, shape: tuple[int, ...]) -> None:
 def _wrong_rows(name: str, values: Any, wanted: str) -> ConfigurationError:
     valid = f"values {wanted} for n robots, each from its own row; reduce by axis=-1"
     return ConfigurationError(name, f"of shape {np.shape(values)} for {_EXAMPLES}", valid)
-
-
-def _equal(row: Any, single: Any) -> bool:
-    """Return whether a row equals the result of the state alone, (1, ...)."""
-    return np.shape(single) == (1, *np.shape(row)) and np.allclose(row, single[0], equal_nan=True)
 
 
 def _example_states(machine: Machine, scene: Scene) -> State:

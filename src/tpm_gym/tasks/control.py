@@ -1,8 +1,8 @@
-"""Controls: from actions to commands for point P, and back.
+"""Controls: conversion of actions to commands for point P, and back.
 
 Every control computes a Cartesian command inside the machine's region, at most the step limit away
-from the last command. So the simulation can follow every command. Rows first;
-everything is in the machine's frame.
+from the last command. So the simulation can follow every command. Arrays have rows first, and are
+in the machine's frame.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from tpm_gym.simulation.state import CONTROL_PERIOD
 
 __all__ = ["CartesianControl", "Control", "Follower", "JointControl", "make_control"]
 
-_TRIES = 6  # largest number of shares of a step that are tried
-_AIM = 0.9995  # fraction of the limit that a try aims at
+_TRIES = 6  # largest number of tries to scale a joint step down to the step limit
+_AIM = 0.9995  # fraction of the step limit that a try aims at
 USABLE = 0.95
-"""Share of the peak torque that commands may need; the rest is for what disturbs the robot."""
-_PARTS = 32  # parts of a line; within a part, joints turn almost uniformly
+"""Share of the peak torque that commands may need; the rest is a reserve for disturbances."""
+_PARTS = 32  # parts of a straight line; within a part, joints turn at almost constant speed
 
 
 class Control(Protocol):
@@ -46,19 +46,19 @@ class Control(Protocol):
         """Return the number of control steps between two points (3,) m at the highest speed."""
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Return the places (n, 3) of points (n, 3) m, whose differences are actions."""
+        """Convert points (n, 3) m to coordinates (n, 3) whose differences are actions."""
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Return the motion of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
+        """Return the displacement of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
 
 
 class CartesianControl:
-    """Actions are increments of point P along x, y, z, in units of the machine's step limit."""
+    """Control whose actions are increments of P along x, y, z, in units of the step limit."""
 
     name = "cartesian"
 
     def __init__(self, machine: Machine, period: float = CONTROL_PERIOD) -> None:
-        """Take the limits of a machine in a control period, s."""
+        """Store the limits of a machine for a control ``period``, s."""
         self._step = np.array(machine.step_limit) * (period / CONTROL_PERIOD)
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
 
@@ -76,7 +76,7 @@ class CartesianControl:
         return actions
 
     def steps(self, wanted: FloatArray, current: FloatArray) -> float:
-        """Count the steps of the axis that has farthest to go."""
+        """Return the number of steps that the slowest axis needs."""
         return float((np.abs(wanted - current) / self._step).max())
 
     def scaled(self, points: FloatArray) -> FloatArray:
@@ -84,32 +84,32 @@ class CartesianControl:
         return points / self._step
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Repeat the step limit, on the diagonal."""
+        """Return diagonal matrices of the step limit."""
         return np.tile(np.diag(self._step), (len(points), 1, 1))
 
 
 class JointControl:
-    """Actions are increments of the three joints, in units of the machine's joint limit.
+    """Control whose actions are increments of the three joints, in units of the joint limit.
 
-    All three joints are slowed down together where the increment would move P farther than the
-    step limit, or into a posture that cannot be assembled. (This is frequent along y, where small
-    turns of the joints move the platform far.) A command beyond the region is projected into it.
+    The increment is scaled down as a whole if it would move P farther than the step limit, or into
+    a posture that cannot be assembled. (This is frequent along y, where small turns of the joints
+    move the platform far.) A command beyond the region is projected into it.
     """
 
     name = "joints"
 
     def __init__(self, machine: Machine, period: float = CONTROL_PERIOD) -> None:
-        """Take the limits of a machine in a control period, s."""
+        """Store the limits of a machine for a control ``period``, s."""
         share = period / CONTROL_PERIOD
         self._machine, self._step = machine, np.array(machine.step_limit) * share
         self._turn = machine.joint_limit * share
 
     def command(self, actions: FloatArray, current: FloatArray) -> FloatArray:
-        """Move P by the joints' increment, slowed down where necessary."""
+        """Move P by the joints' increment, scaled down where necessary."""
         machine = self._machine
         theta = machine.inverse(current)
         step = actions * self._turn
-        # Start with twice the share that reaches the limit according to J; the exact share is near.
+        # The first try is twice the share that reaches the limit according to the Jacobian J.
         rate = np.abs((machine.evaluate(theta).jacobian * step[:, None]).sum(axis=-1))
         share = np.minimum(1.0, 2 * (self._step / np.maximum(rate, 1e-12)).min(axis=-1))
         point, excess = self._tried(current, theta, step, share)
@@ -122,9 +122,10 @@ class JointControl:
     def _tried(
         self, current: FloatArray, theta: FloatArray, step: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return P (r, 3) m after a share (r,) of the increment, and its way in units of the limit.
+        """Return P (r, 3) m after a share (r,) of the increment, and its displacement (r,).
 
-        The way is infinite where P cannot be assembled in the machine's modes.
+        The displacement is the largest one of x, y and z, in units of the step limit. It is
+        infinite where the machine cannot be assembled in its modes.
         """
         point = self._machine.forward(theta + share[:, None] * step)
         way = (np.abs(point - current) / self._step).max(axis=-1)
@@ -140,9 +141,10 @@ class JointControl:
     ) -> FloatArray:
         """Shorten the increment until P moves by the limit, to a thousandth; return P (r, 3) m.
 
-        The secant through two tries gives the next one. Division alone converges slowly next to the
-        serial singularity, where P slows down along the way. P stays where it is if no try is
-        within the limit, next to a parallel singularity.
+        ``excess`` is the displacement at ``share``. The secant through two tries gives the next
+        try. (Dividing by the excess alone converges slowly next to the serial singularity, where P
+        slows down along the way.) Next to a parallel singularity no try may be within the limit; P
+        stays where it is then.
         """
         point, low, high = current, np.zeros_like(share), share
         before, was = np.zeros_like(share), np.zeros_like(share)
@@ -188,11 +190,12 @@ class JointControl:
 
 
 class Follower:
-    """Limit of commands to what the motors can follow, by closed-form dynamics.
+    """Limit of commands to motions that the motors can follow, by closed-form dynamics.
 
-    The change of the step from one command to the next is limited along each axis. It is then
-    shortened as a whole to what a share of the motors' peak torques allows the nominal machine,
-    :data:`USABLE`. No command goes too fast towards an end of the region to stop there.
+    A step is the difference of two successive commands. Its change from the last step is limited
+    along each axis. The step itself is limited so that P can stop at an end of the region. Then the
+    change is scaled down as a whole until the nominal machine needs at most the share
+    :data:`USABLE` of its motors' peak torques.
 
     Args:
         machine: Machine; its payload counts.
@@ -204,7 +207,7 @@ class Follower:
     def __init__(
         self, machine: Machine, acceleration: ArrayLike, braking: ArrayLike, period: float
     ) -> None:
-        """Take the limits of a machine."""
+        """Compute the limits of a machine in a control period."""
         self._machine, self._period = machine, period
         self._change, self._brake = (np.array(rate) * period**2 for rate in (acceleration, braking))
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
@@ -252,7 +255,7 @@ class Follower:
 
 
 def make_control(kind: str, machine: Machine, period: float = CONTROL_PERIOD) -> Control:
-    """Make the control of that name, for a control period in s.
+    """Make the control named ``kind``, for a control period in s.
 
     Raises:
         ConfigurationError: If no control has this name.

@@ -21,7 +21,7 @@ from tpm_gym.tasks.task import Entry, Task, dense
 __all__ = ["Conveyor"]
 
 SPEEDS: Final = (0.05, 0.20)
-"""Slowest and fastest belt, m/s."""
+"""Lowest and highest speed of the belt, m/s."""
 LATEST: Final = 1.0
 """Longest time until the block comes within reach, s."""
 SHARE: Final = 0.55
@@ -29,10 +29,10 @@ SHARE: Final = 0.55
 EDGE: Final = 0.030
 """Distance of goals from the end of the belt, m."""
 CLEARANCE: Final = 0.028
-"""Height over the block, or over its place, at which the expert arrives and leaves, m."""
+"""Height over the block, at its start and its goal, at which the expert arrives and leaves, m."""
 UP: Final = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
 SEALING: Final = 4
-"""Control steps to go along with the block until the cup has sealed."""
+"""Number of control steps in which the cup follows the block until it has sealed."""
 GAP: Final = 0.010
 """Distance of the tray from the end of the belt, m."""
 TRAY_COLOUR: Final = (0.45, 0.62, 0.80, 1.0)
@@ -95,7 +95,7 @@ class Conveyor(Task):
         return ends.min(axis=0), ends.max(axis=0)
 
     def _draw(self, first: float, last: float, rng: np.random.Generator) -> FloatArray:
-        """Draw a place (3,) m between two x, so that the whole way between them is safe."""
+        """Draw a place (3,) m between two values of x; the whole line between them is safe."""
         low, high = self._floor
 
         def draw(rng: np.random.Generator) -> FloatArray:
@@ -110,14 +110,14 @@ class Conveyor(Task):
         return sampling.safe_draw(rng, self.machine, self.goals, draw, ways)
 
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
-        """Return the corners of the belt, over the robot's reach in y."""
+        """Return the corners of the part of the belt that is within the robot's reach in y."""
         low, high = self.reach_of(block)
         low[0], high[0] = self.belt.start + self.block.width, self.belt.end
         high[2] = low[2]
         return low, high
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the tray."""
+        """Return the corners of the part of the tray that the robot can reach."""
         low, high = self.reach_of(block)
         low[0], high[2] = self.belt.end + EDGE, low[2]
         return [(low, high)]
@@ -164,7 +164,7 @@ class Conveyor(Task):
         yield from [Move(place, True), Move(place, True), Move(place, False)]  # the platform lags
 
     def _pick(self, camera: _Camera, leave: list[FloatArray]) -> Iterator[Move]:
-        """Wait until the block is within reach or stands still, go along with it, and seal."""
+        """Wait until the block is within reach or stands still, follow it, and seal the cup."""
         motion, first = camera.motion, self._floor[0][0]
         gate = camera.above(CLEARANCE)
         gate[0] = self.machine.mount.to_paper(np.array([first, 0.0, 0.0]))[0]
@@ -182,27 +182,27 @@ class Conveyor(Task):
 
 
 class _Camera:
-    """Estimate of where a block is now, from pictures that are late."""
+    """Estimate of a block's present position from delayed pictures."""
 
     def __init__(self, task: Conveyor, motion: Motion, block: Block) -> None:
         self.motion, self.block, self._task = motion, block, task
         self._trail = deque([motion.seen["position"]], maxlen=task.camera_delay + 1)
 
     def watch(self, moves: Iterator[Move]) -> Iterator[Move]:
-        """Yield moves, and note where P is."""
+        """Yield moves, and record the position of P after each."""
         for move in moves:
             yield move
             self._trail.append(self.motion.seen["position"])
 
     def step(self) -> FloatArray:
-        """Return the way (3,) m of the belt in a control step, machine's frame."""
+        """Return the block's displacement (3,) m by the belt in a control step, machine's frame."""
         speed = float(self.motion.seen["belt_speed"][0])
         riding = self._seen("position")[0] < self._task.belt.end
         way = np.array([riding * speed * self.motion.period, 0.0, 0.0])
         return self.motion.machine.mount.rotate(way)
 
     def place(self) -> FloatArray:
-        """Return the block's centre (3,) m now, world; it rides on the belt since the picture."""
+        """Return the block's centre (3,) m now, world: as in the picture, moved by the belt."""
         steps = len(self._trail) - 1
         if self._seen("velocity")[0] > self.motion.seen["belt_speed"][0] / 2:
             steps = self._task.camera_delay

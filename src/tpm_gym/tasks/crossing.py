@@ -28,8 +28,8 @@ class Crossing(Task):
     In the plane y = 0, a parallel singularity, no torque of the motors acts along y, and no way
     leads around the plane. So P has to pass it by inertia. The torques stay finite only if the
     velocity along y is constant there. The mechanism changes its assembly mode, which does not end
-    the episode. With too little speed, or an acceleration, P turns back; then the command is
-    mirrored to the side where P is.
+    the episode. With too little speed, or an acceleration, P turns back; the command is then
+    mirrored to the side of P.
 
     P starts at home. Goals are the mirror images of those of Reach. Only Cartesian control can name
     a side: joint positions are equal on both sides.
@@ -65,7 +65,7 @@ class Crossing(Task):
         return beyond
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Move straight to the goal; the velocity is constant but for the ends."""
+        """Move straight to the goal; the velocity is constant except near the two ends."""
         goal = motion.machine.mount.to_paper(motion.goal)
         yield from motion.go([goal], vacuum=False)
         while True:

@@ -34,18 +34,19 @@ SPEED: Final = 5.0
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
-"""Largest RMS torque of the timing, as a share of the peak torque; 2% are for the servos."""
+"""Largest RMS torque of the plan, as a share of the peak torque; 2% are a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Accelerations of the command along x, y, z, as shares of what the peak torque gives P alone."""
+"""Accelerations of the command along x, y, z, as shares of those along one axis at peak torque."""
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
-Along x the way ends close to the region, along z far from it. Both together have to be possible.
+Along x the way ends close to the end of the region, along z far from it. The motors must be able
+to brake along both at a time.
 """
 NEAR: Final = 0.010
-"""Distance to the end from which on a dense reward costs 1 more, m."""
+"""Distance to the goal, m, from which on the extra term of a dense reward stays at -1."""
 UNIT: Final = 0.005
-"""Depth below the gate that costs 1 in each step, m."""
+"""Depth of P below the gate at which the reward term is -1 in each step, m."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""
@@ -186,7 +187,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Subtract the distance, up to 10 mm, in units of 10 mm from a dense reward as well."""
+        """Add to a dense reward minus the distance up to 10 mm, in units of 10 mm."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 
@@ -198,7 +199,7 @@ class Cycle(Task):
         return {"gate": np.minimum(-below / UNIT, 0.0)}
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Follow the gate in the least time for which motors can repeat the way without end."""
+        """Follow the gate as fast as the motors can without overheating if they repeat it."""
         start, goal = motion.command, self.machine.mount.to_paper(motion.goal)
         path = self.gate(start[1], backwards=bool(start[0] > goal[0]))
         times, _ = timed(self.machine, path, CONTINUOUS * self._peak, USABLE * self._peak)

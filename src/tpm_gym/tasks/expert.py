@@ -1,4 +1,4 @@
-"""The scripted controller of all tasks, on closed-form kinematics.
+"""The expert: the scripted controller of all tasks, on closed-form kinematics.
 
 The expert gets the same observation as a policy. For each robot it follows the task's plan, which
 moves point P with trapezoidal speed, and converts each command into an action of the environment's
@@ -82,7 +82,7 @@ class Expert:
         return actions[0] if self._alone else actions
 
     def _look(self, observation: dict[str, Any]) -> None:
-        """Show each plan its robot, and begin the plans of new episodes."""
+        """Give each plan the observation of its robot, and start the plans of new episodes."""
         seen = self._task.decode(np.atleast_2d(observation["observation"]))
         goals = np.atleast_2d(np.asarray(observation["desired_goal"], dtype=np.float64))
         episodes = np.atleast_1d(self._env.episode)

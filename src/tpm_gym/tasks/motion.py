@@ -25,7 +25,7 @@ ROUNDING = 1e-5
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
 SLOW_ABOVE = CUP.seal_gap + 0.001
-"""Height of the lip over a block from where a gentle pick goes on slowly, m."""
+"""Height of the lip over a block below which a gentle pick moves slowly, m."""
 SLOW_SPEED = 0.025
 """Speed of a gentle pick below that height, m/s."""
 
@@ -70,24 +70,31 @@ class Motion:
             command = self._control.command(action[None], command[None])[0]
         return command
 
-    def holding(self, name: str = "object") -> bool:
-        """Return whether the cup holds the object of that name.
+    def holding(self, name: str | None = None) -> bool:
+        """Return whether the cup holds the object of that name, by default the only object.
 
         Raises:
-            ConfigurationError: If the task does not observe the object.
+            ConfigurationError: If the task does not observe the object, or has several and ``name``
+                is None.
         """
-        return bool(self._see(f"{name}_held")[0] > 0.5)
+        return bool(self._see(name, "held")[0] > 0.5)
 
-    def carried_to(self, place: FloatArray, name: str = "object") -> FloatArray:
-        """Return P (3,) m, machine's frame, that has the held object's centre at ``place`` (world).
+    def carried_to(self, place: FloatArray, name: str | None = None) -> FloatArray:
+        """Return P (3,) m, machine's frame, for the held object's centre to be at ``place``.
 
-        The cup does not hold an object exactly at its middle.
+        ``place`` is (3,) m, world frame. The cup does not hold an object exactly at its middle.
+        Name and errors are as in :meth:`holding`.
         """
-        grip = self.seen["position"] - self._see(f"{name}_position")
+        grip = self.seen["position"] - self._see(name, "position")
         return self.machine.mount.to_paper(place + grip)
 
-    def _see(self, entry: str) -> FloatArray:
-        if entry not in self.seen:
+    def _see(self, name: str | None, what: str) -> FloatArray:
+        if name is None:
+            names = [entry[: -len("_held")] for entry in self.seen if entry.endswith("_held")]
+            if len(names) > 1:
+                raise ConfigurationError("name", name, f"one of {', '.join(names)}")
+            name = names[0] if names else "object"
+        if (entry := f"{name}_{what}") not in self.seen:
             valid = f"entries with {entry!r}; add object_entries(i) of that object"
             raise ConfigurationError("observed()", list(self.seen), valid)
         return self.seen[entry]
@@ -128,7 +135,7 @@ class Motion:
         """
         start, place = self.command, target()
         way = place + above - step - start
-        # The way relative to the target is longer, as far as P needs a part of its speed to follow.
+        # Following the target needs a part of P's speed, so that the relative way takes longer.
         spare = 1 - np.abs(step) / self._reach
         across = self.trapezoid(start, start + way / spare)
         for done, down in self._overlapped([across, self.trapezoid(place + above, place)]):
@@ -154,7 +161,7 @@ class Motion:
         Args:
             block: The block.
             clearance: Height over the block from where P comes down, m.
-            gently: Whether P comes to rest above the block, and goes on slowly until the cup seals.
+            gently: Whether P stops above the block, and then comes down slowly until the cup seals.
                 Otherwise it presses the block on the table.
 
         Raises:
@@ -172,7 +179,7 @@ class Motion:
 
     def _above(self, block: Block, clearance: float) -> FloatArray:
         """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
-        place = self._see(f"{block.name}_position") + hanging(block)
+        place = self._see(block.name, "position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:

@@ -17,9 +17,9 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.028
-"""Height over the block, or over its place, at which the expert arrives and leaves, m.
+"""Height over the block, at its start and its goal, at which the expert arrives and leaves, m.
 
-It is no multiple of the tolerance: otherwise the last bit would decide about successes.
+It is no multiple of the tolerance, so that rounding errors do not decide about success.
 """
 RELEASE_HEIGHT = 0.0005
 """Height over its place on the table to which the expert carries the block, m.

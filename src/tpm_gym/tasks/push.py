@@ -19,18 +19,18 @@ from tpm_gym.tasks.task import Entry, Task, dense
 __all__ = ["Push"]
 
 CLEARANCE: Final = 0.008
-"""Gap between lip and block where the lip comes down beside the block, and over the block, m."""
+"""Height of the lip over the block on arrival, and gap between both as it comes down, m."""
 SHORTEST: Final = 0.060
 LONGEST: Final = 0.240
-"""Shortest and longest way of the block along the normal of the pushed face, m."""
+"""Smallest and largest displacement of the block along the normal of the pushed face, m."""
 SLOPE: Final = 0.10
-"""Largest slope of the way against the normal of the pushed face."""
+"""Largest tangent of the angle between the block's path and the normal of the pushed face."""
 PACE: Final = 0.014
 """Distance that the expert moves the lip in 40 ms while it pushes, m."""
 SIDEWAYS: Final = 0.15
-"""Largest slope of the expert's pushing direction against the normal of the face."""
+"""Largest tangent of the angle between the expert's push and the line from start to goal."""
 CLOSE: Final = 0.001
-"""Remaining way at which the expert stops, m."""
+"""Remaining distance to the goal at which the expert stops, m."""
 UPRIGHT: Final = math.cos(math.radians(45))
 """Smallest z of the axis of a block that stands."""
 
@@ -54,7 +54,7 @@ class Push(Task):
     def sample(
         self, rngs: Sequence[np.random.Generator], chosen: Mapping[str, FloatArray]
     ) -> dict[str, FloatArray]:
-        """See the base class; a chosen place must leave room for a way."""
+        """See the base class; a chosen start or goal must leave room for a push."""
         ways = np.empty((len(rngs), 2, 3))  # start and goal
         rows = np.arange(0 if len(chosen) == 2 else len(rngs))
         for _ in range(_ATTEMPTS):
@@ -84,7 +84,7 @@ class Push(Task):
         return rng.uniform(table.low, table.high, (_DRAWS, 2, 3))
 
     def _can_push(self, ways: FloatArray) -> BoolArray:
-        """Return whether the robot can push blocks along ways (..., 2, 3) m, as (...,)."""
+        """Return whether the robot can push blocks from start to goal, (..., 2, 3) m, as (...,)."""
         machine, along = self.machine, np.diff(ways, axis=-2)
         across, distance = np.moveaxis(np.sort(np.abs(along[..., 0, :2])), -1, 0)
         square = (distance >= SHORTEST) & (distance <= LONGEST) & (across <= SLOPE * distance)
@@ -95,7 +95,9 @@ class Push(Task):
         return fits
 
     def behind(self, place: FloatArray, way: FloatArray, gap: float) -> FloatArray:
-        """Return P (..., 3) m, world, with the lip low behind blocks that shall move along ``way``.
+        """Return places of P from which the lip can push blocks along ``way``, (..., 3) m, world.
+
+        The lip is behind the block there, and P as low as the region allows.
 
         Args:
             place: Centres (..., 3) m of the blocks.

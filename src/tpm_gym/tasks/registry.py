@@ -36,7 +36,7 @@ def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -
 
     Raises:
         ConfigurationError: If there is no such task, an option is out of range, or options are
-            given with a finished task.
+            given with an instance of a task.
     """
     options = {"machine": machine, **options}
     given = {name: value for name, value in options.items() if value is not None}

@@ -50,7 +50,7 @@ _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 def safe_points(
     rngs: Sequence[np.random.Generator],
     machine: Machine,
-    regions: Mapping[str, Sequence[Region]],
+    regions: Mapping[str, Region | Sequence[Region]],
     known: Mapping[str, ArrayLike],
     apart: float = APART,
     near_singularity: bool = False,
@@ -60,7 +60,7 @@ def safe_points(
     Args:
         rngs: One for each of r rows.
         machine: Machine that defines the safe points.
-        regions: For each name, the equally likely regions of its point.
+        regions: For each name, the region of its point, or equally likely ones.
         known: Points (3,) or (r, 3) m that are not drawn, by name.
         apart: Smallest distance, m.
         near_singularity: Whether the points are just above the threshold.
@@ -76,7 +76,8 @@ def safe_points(
     points = np.empty((len(rngs), len(names), 3))
     for index, point in enumerate(known.values()):
         points[:, index] = point
-    parts = [regions[name] for name in names[first:]]
+    chosen = [regions[name] for name in names[first:]]
+    parts = [[part] if isinstance(part, Region) else part for part in chosen]
     boxes = np.array([(box.low, box.high) for part in parts for box in part]).reshape(-1, 2, 3)
     counts = np.array([len(part) for part in parts], dtype=np.int64)
     least, most = _limits(machine, near_singularity)
@@ -105,7 +106,7 @@ def safe_draw(
     draw: Callable[[np.random.Generator], FloatArray],
     ways: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Draw points until the way that belongs to one is safe, and return that point (3,).
+    """Draw points until one has a safe way; return this point, (3,).
 
     Args:
         rng: Generator of the row.
@@ -136,7 +137,7 @@ def _no_tempting(reason: str) -> ConfigurationError:
 
 
 def _limits(machine: Machine, near_singularity: bool) -> tuple[float, float]:
-    """Return the lowest conditioning of points, and the one below which it lies."""
+    """Return the limits of the conditioning of points: the lowest value, and an upper bound."""
     safe = machine.safe_conditioning
     return safe, safe + BAND if near_singularity else math.inf
 

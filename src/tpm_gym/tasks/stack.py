@@ -52,7 +52,7 @@ class Stack(Task):
         known = {name: mount.to_paper(place[:, :3] + offset) for name, place in chosen.items()}
         table = self.on_table(self.lower)
         regions = {name: [table] for name in ("lower", "upper", "goal")}
-        # On a table that is deep enough, blocks that overlap can be a diagonal apart.
+        # Blocks that touch at their corners are a diagonal apart, or less on a shallow table.
         sides = np.minimum(self.lower.width, np.subtract(table.high, table.low)[:2])
         apart = max(APART, float(np.hypot(*sides)) + CLEAR)
         points = sampling.safe_points(
@@ -79,7 +79,7 @@ class Stack(Task):
         up = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         for block, goal in zip(self.scene.objects, motion.goal.reshape(2, 3), strict=True):
             while True:
-                if not motion.holding(block.name):  # else: of an episode that was restored
+                if not motion.holding(block.name):  # a restored episode may begin with it held
                     yield from motion.pick(block, CLEARANCE)
                 place = motion.carried_to(goal, block.name)
                 way = [motion.command + up, place + up, place]

@@ -84,9 +84,9 @@ class Task(ABC):
         controls: Names of the controls that can perform the task.
         events: Names of methods of the task. ``info`` has their results for the state, (n,) bool,
             and an evaluation the share of episodes in which each was true after a step.
-        control_period: Time between two actions, s. Limits of the machine hold in 40 ms, and are
-            scaled to it. In shorter periods commands can ask for more torque than the motors have,
-            unless :attr:`accelerations` are set; a shield requires them then.
+        control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
+            scaled to this time. In shorter periods commands can ask for more torque than the motors
+            have, unless :attr:`accelerations` are set; a shield requires them then.
         accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
             and its deceleration before the ends of the region, m/s^2; None for any.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
@@ -134,6 +134,8 @@ class Task(ABC):
             raise ConfigurationError("tolerance", self.tolerance, "a positive number")
         if not is_whole(self.camera_delay, 0):
             raise ConfigurationError("camera_delay", self.camera_delay, "a whole number, 0 or more")
+        if not isinstance(self.scene, Scene):
+            raise ConfigurationError("scene", self.scene, "a Scene; Scene() has no objects")
         self.machine, self.reward, self.goals = machine, reward, goals
         shown = len(self.markers(np.zeros(self.goal_size)))
         if shown != self.scene.markers:
@@ -197,7 +199,7 @@ class Task(ABC):
         return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Yield the moves of the scripted controller for one robot; the last move is kept.
+        """Yield the moves of the expert for one robot; the last move is kept.
 
         Raises:
             ConfigurationError: If the task has no plan.
@@ -356,14 +358,19 @@ class Task(ABC):
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the low and high corners (3,) m of the places where a block may start.
 
-        They are what the robot can reach. A task whose blocks come from elsewhere overrides this.
+        By default the robot can reach them all. A task whose blocks come from elsewhere overrides
+        this.
         """
         return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return boxes, as lowest and highest place (3,) m, of goals for point P or for a block.
+        """Return the boxes in which goals lie, as low and high corners (3,) m each.
 
-        They are what the robot can reach. A task that aims elsewhere overrides this.
+        By default there is one box: the reach of point P, or of a block in the cup. A task with
+        goals elsewhere overrides this.
+
+        Args:
+            block: The block whose goals they are; None for goals of point P.
         """
         return [self.reach_of(block)]
 

@@ -23,20 +23,21 @@ NEAREST: Final = 0.040
 FARTHEST: Final = 0.150
 """Limits of the distance of goals from the end of the region, along x, m."""
 CLEARANCE: Final = 0.028
-"""Height over the block at which the expert arrives and to which it leaves, m."""
+"""Height of the cup over the block before and after the expert picks it, m."""
 DROP: Final = 0.003
 """Height over the table at which the block is let go, m; low, so that it does not tumble."""
 BRAKING: Final = 0.050
 """Distance from the place of release to the end of the region, within which P stops, m."""
 RUN_UP: Final = (1 / 3, 2 / 3, 1.0, 1.0, 1.0)
-"""Steps of the command in units of the last one, in which the cup lets go.
+"""Steps of the command in the run-up, in units of the last step, in which the cup lets go.
 
-The path is a spline of three commands, so that three equal steps give a period of constant speed.
+The path is a spline of three commands. So the three equal steps give a control period of constant
+speed.
 """
 VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / Task.control_period
 """Time from the command to let go until the block is free, in control periods."""
 AHEAD: Final = 1.5 - VENTED
-"""Distance from the place of release to the command of that period, in units of its step.
+"""Distance from the place of release to the command of its control period, in units of the step.
 
 The spline lags the commands by half a period.
 """
@@ -50,9 +51,9 @@ class Throw(Task):
 
     The goals lie on the table outside the workspace, 40 to 150 mm beyond either end of the
     machine's region along x, as far as its table and its speed allow. The block is slippery: at a
-    speed v it slides v^2 / (2 mu g), with mu = 0.1 against the table. The goal is achieved where
-    the centre of the block is within 20 mm of it. With ``goals="tempting"``, the way on which P
-    runs up, lets go and stops is only just safe.
+    speed v it slides v^2 / (2 mu g), with mu = 0.1 against the table. The goal is achieved if the
+    centre of the block is within 20 mm of it. With ``goals="tempting"``, the path on which P runs
+    up, lets go and stops is only just safe.
     """
 
     block = Block(friction=0.1)
@@ -120,7 +121,7 @@ class Throw(Task):
         """Return where the block is let go, (..., 3) m, and the way along x in one step, (...,) m.
 
         A block that falls by h meets the table with the impulse m sqrt(2 g h), and friction takes
-        mu times that away from the speed v. So it gets v^2 / (2 mu g) + mu h far, fall included.
+        mu sqrt(2 g h) away from the speed v. Fall and slide together are v^2 / (2 mu g) + mu h.
         """
         low, high = self.reach_of(self.block)
         side = np.where(goal[..., 0] > (low[0] + high[0]) / 2, 1.0, -1.0)
@@ -132,7 +133,7 @@ class Throw(Task):
         return place, side * speed * self.control_period
 
     def _lane(self, goal: FloatArray) -> FloatArray:
-        """Return where P begins to run up and where it has stopped, (..., 2, 3) m, own frame."""
+        """Return where P begins to run up and where it stops, (..., 2, 3) m, machine's frame."""
         place, step = self._release(goal)
         lane = np.stack([place, place], axis=-2)
         lane[..., 0, 0] -= _RUN_UP_WAY * step

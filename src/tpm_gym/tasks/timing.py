@@ -1,4 +1,4 @@
-"""Timing of a path: as fast as the motors can follow it again and again.
+"""Timing of a path: the shortest time in which the motors can repeat the path without overheating.
 
 A motor that repeats a motion must not exceed its continuous torque on average (RMS), since the
 winding heats up with the square of the torque. Tools for time-optimal path parameterisation bound
@@ -26,13 +26,13 @@ _TOLERANCE: Final = 1e-9
 def timed(
     machine: Machine, path: FloatArray, continuous: ArrayLike, peak: ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Compute when P passes the points of a path, from rest to rest, as early as torques allow.
+    """Compute the earliest times at which P can pass the points of a path, from rest to rest.
 
     With the path parameter s in [0, 1] and b = (ds/dt)^2, the torque is A b'/2 + B b + g, where A,
-    B and g follow from the closed-form dynamics. The time and the heat of all motors are convex in
-    b, and so is their sum, which Newton's method minimises. Without the weight g, the shape of the
-    optimal b does not depend on how both are weighed. So the shape is found once, and is then
-    scaled in time until the first motor reaches a limit.
+    B and the gravity torque g follow from the closed-form dynamics. The time and the heat of all
+    motors are convex in b, and so is their sum, which Newton's method minimises. Without g, the
+    shape of the optimal b does not depend on the factors of time and heat in the sum. So the shape
+    is found once, without g. It is then scaled in time until, with g, a motor reaches a limit.
 
     Args:
         machine: Machine; its payload counts.
@@ -53,7 +53,7 @@ def timed(
     rest = machine.torque(middle, 0 * first, 0 * first)
     along = (machine.torque(middle, 0 * first, first) - rest) * count / 2
     across = (machine.torque(middle, first, second) - rest) / 2
-    # Torque between points k and k + 1 without weight: end[k] b[k + 1] + begin[k] b[k]
+    # Torque between points k and k + 1 without gravity: end[k] b[k + 1] + begin[k] b[k]
     begin, end = across - along, across + along
     squared = _fastest(begin, end)
     spans, torques = _spans(squared), _torques(squared, begin, end)
@@ -70,7 +70,7 @@ def _spans(squared: FloatArray) -> FloatArray:
 
 
 def _torques(squared: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the torques (N, 3) between points, without weight."""
+    """Return the torques (N, 3) between points, without gravity."""
     return begin * squared[:-1, None] + end * squared[1:, None]
 
 
@@ -106,7 +106,7 @@ def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
 def _derivatives(
     squared: FloatArray, begin: FloatArray, end: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost by the inner b."""
+    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in b between the ends."""
     count, spans, torques = len(begin), _spans(squared), _torques(squared, begin, end)
     speed = np.sqrt(squared)
     weight = 1 + (torques**2).sum(axis=1)

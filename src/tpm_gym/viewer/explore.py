@@ -88,7 +88,7 @@ class Explore:
         self.go_home()
 
     async def _dragged(self, event: Any) -> None:
-        # Not a thread of viser's: those may run out of order.
+        # A coroutine runs in viser's event loop, in order. Its threads may run out of order.
         position = event.target.position
         self._worker.put("drag", lambda: self.drag(position))
 
@@ -96,7 +96,7 @@ class Explore:
 
     @property
     def working(self) -> Any:
-        """Working mode that the panel asks for."""
+        """Working mode that is chosen in the panel."""
         words = (handle.value for handle in self.working_lists if handle.visible)
         return self._kind.working[tuple(words)]
 
@@ -122,7 +122,7 @@ class Explore:
     def set(self, posture: Posture) -> None:
         """Show a posture, and its modes and motors in the panel."""
         self.posture = posture
-        # All messages at once: each wakes the thread that sends them.
+        # All messages are sent together, since each message wakes the thread that sends them.
         with self._server.atomic():
             self._set_panel(posture)
             self.gizmo.position = posture.position
@@ -150,7 +150,7 @@ class Explore:
 
     @property
     def text(self) -> str:
-        """The reason in the panel, as HTML."""
+        """The message in the panel why a posture does not exist, as HTML; empty if it exists."""
         return str(self._refusal.content)
 
     def _attempt(self, solve: Callable[[], Posture]) -> None:
@@ -177,7 +177,7 @@ class Explore:
 
 
 def units(machine: Machine) -> list[tuple[float, str]]:
-    """Return factor and name of the panel's unit of each motor, for rad or m."""
+    """Return, for each motor, the factor from rad or m to the panel's unit, and its name."""
     of_motor = {"rad": (math.degrees(1.0), "°"), "m": (1000.0, "mm")}
     return [of_motor[motor.unit] for motor in machine.mechanism.motors]
 

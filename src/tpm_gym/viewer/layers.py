@@ -60,13 +60,13 @@ class Layers:
         self._keys: dict[str, Any] = {}
 
     def around(self, posture: Posture) -> Mapping[str, Found]:
-        """Return the layers that there are around a posture: the task's region, and the kind's."""
+        """Return the available layers of a posture by name: the regions, and the kind's layers."""
         machine = self._kind.machine
         regions = {"region": machine.region, "goals": machine.goal_region}
         return {"region": ("always", lambda: regions), **self._kind.layers(posture)}
 
     def show(self, names: Collection[str], posture: Posture) -> None:
-        """Show these layers for a posture, as far as there are, and hide the others."""
+        """Show the available layers in ``names`` for a posture, and hide all others."""
         there = self.around(posture)
         for name, (_, _, draw) in LAYERS.items():
             wanted, find = there[name] if name in names and name in there else (None, None)
@@ -81,8 +81,8 @@ class Layers:
     # -- drawing of layers --------------------------------------------------------------------
 
     def _mesh(self, name: str, mesh: Mesh, paint: tuple[int, int, int], opacity: float) -> Node:
-        # BLEND keeps a sheet from hiding the sheets behind it; viser's simple mesh has no such
-        # option, and shows patches of each.
+        # Without BLEND, parts of a sheet would hide the sheets behind it. viser's simple mesh does
+        # not have this option.
         linear = [round(255 * (part / 255) ** 2.2) for part in paint]
         visual: Any = trimesh.visual
         material = visual.material.PBRMaterial(
@@ -91,7 +91,7 @@ class Layers:
         )  # fmt: skip
         look = visual.TextureVisuals(material=material)
         painted = trimesh.Trimesh(*mesh, visual=look, process=False)
-        _ = painted.vertex_normals  # written only if known; without them, each triangle is flat
+        _ = painted.vertex_normals  # exported only once computed; without them, shading is flat
         return self._scene.add_mesh_trimesh(
             f"{ROBOT}/{name}", painted, cast_shadow=False, receive_shadow=False
         )

@@ -17,7 +17,7 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import reachable
 
 _AROUND = 33  # points along the half circle of link 7
-_SLACK = 1e-9  # share of l4 by which a leg may miss a boundary on which it lies
+_SLACK = 1e-9  # fraction of l4, by which a leg may fail to reach a point on its boundary
 _SMOOTHING = 4  # rounds
 _HALVINGS = 8
 _STEPS = 200  # points along each edge of a slice
@@ -45,7 +45,8 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
         points = _torus(geometry)
     else:
         points = _swept(factor, mode, geometry)
-    # A leg that is stretched reaches with a longer rod; one that is folded, with a shorter rod.
+    # On the surface, rounding may put a point out of reach. A stretched leg then reaches it with a
+    # longer rod, a folded leg with a shorter rod.
     longer, shorter = (replace(geometry, l4=geometry.l4 * (1 + sign * _SLACK)) for sign in (1, -1))
 
     def there(points: FloatArray) -> BoolArray:
@@ -58,9 +59,9 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
 
 
 def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> FloatArray:
-    """Move the first points outside of a region to its boundary, in flat grids (m, a, b, 3).
+    """Cut m flat grids of points (m, a, b, 3) at the boundary of a region.
 
-    Points farther outside become NaN.
+    Points next to the region move to its boundary. Points farther outside become NaN.
     """
     there = inside(points)
     found = np.where(there[..., None], points, np.nan)
@@ -78,7 +79,10 @@ def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> Fl
 
 
 def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """Return points (m, a, b, 3) of a curve of C1 that link 7 sweeps; NaN in other modes."""
+    """Return the points P (m, a, b, 3) to which link 7 turns from the factor's curves of point C1.
+
+    Points of other working modes are NaN.
+    """
     x, z, p, q = (part[..., None] for part in sheets.curves(factor, mode, g))
     beta = np.linspace(-np.pi / 2, np.pi / 2, _AROUND)
     cos, sin = mode.cos_beta * np.cos(beta), np.sin(beta)
@@ -88,7 +92,7 @@ def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
 
 
 def _planes(factor: str, g: Geometry) -> FloatArray:
-    """Return points (m, a, b, 3) of the plane y = 0 of sin(beta), or |y| = l7 of cos(beta)."""
+    """Return points (m, a, b, 3) where sin(beta) = 0 (plane y = 0) or cos(beta) = 0 (|y| = l7)."""
     reach = g.l3 + g.l4
     x = np.linspace(-g.l1 - reach - g.l7, g.l1 + reach + g.l7, 241)
     z = np.linspace(-reach, reach + 2 * g.l6, 181)
@@ -118,13 +122,13 @@ SURFACES: Final = {
 
 
 def grid_mesh(points: FloatArray) -> Mesh:
-    """Return the triangles of grids of points (m, a, b, 3) without NaN."""
+    """Return the triangles between the points of m grids (m, a, b, 3) that are not NaN."""
     real = ~np.isnan(points[..., 0])
     index = np.arange(real.size).reshape(real.shape)
     corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]
     quads = np.stack(corners, axis=-1).reshape(-1, 4)
     there = real.ravel()[quads]
-    # Three corners make a triangle. Without these, an oblique boundary would have teeth.
+    # A square with one missing corner gives one triangle, so that oblique boundaries have no teeth.
     missing = np.argmin(there, axis=1)[:, None]
     rest = np.take_along_axis(quads, (missing + [1, 2, 3]) % 4, axis=1)[there.sum(axis=1) == 3]
     faces = np.concatenate([_triangles(quads[there.all(axis=1)]), rest])
@@ -160,7 +164,7 @@ def cells_mesh(cells: Cells) -> Mesh:
         for sign in (1, -1):
             start = np.argwhere(change == sign)
             start[:, axis] += 1
-            # Corners run so that the outside is in front; the second axis of three is reversed.
+            # Corners run counter-clockwise as seen from outside; axis 1 needs the reverse order.
             forwards = (sign > 0) == (axis == 1)
             ring = around if forwards else around[::-1]
             quads.append(np.stack([index[tuple((start + step).T)] for step in ring], axis=1))
@@ -171,12 +175,12 @@ def cells_mesh(cells: Cells) -> Mesh:
 
 
 def _triangles(quads: NDArray[Any]) -> NDArray[Any]:
-    """Split quadrilaterals."""
+    """Split each quadrilateral into two triangles."""
     return quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 
 
 def _compact(points: FloatArray, faces: NDArray[Any]) -> Mesh:
-    """Keep the points that are used."""
+    """Drop the points that no face uses, and renumber the faces."""
     used, renamed = np.unique(faces, return_inverse=True)
     return Mesh(points[used], renamed.reshape(faces.shape))
 

@@ -21,7 +21,7 @@ _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1
 """Shortest time between two drawings of the plots, s."""
 _SPEEDS: Final = (0.1, 4.0)
-"""Lowest and highest speed."""
+"""Lowest and highest speed of an episode, in units of real time."""
 _PAUSE: Final = 15
 """Control periods for which the end of an episode stays in view."""
 
@@ -35,7 +35,8 @@ class Play:
         show: Called with the player after every reset and step.
 
     Attributes:
-        player: The episode; None before the first step, and after another choice.
+        player: Player of the episode. None before the first step, and again after another
+            environment, engine, policy or seed is chosen.
     """
 
     def __init__(

@@ -88,7 +88,7 @@ class RobotScene:
     def draw(self, places: Mapping[str, Place]) -> None:
         """Move the links to ``places`` in the base's frame.
 
-        A pose costs 0.2 ms in viser, so links that keep theirs are left alone.
+        Setting a pose takes 0.2 ms in viser, so only poses that have changed are set.
         """
         found = [places[name] for name in self.links]
         turns = SO3.from_matrix(np.stack([place.rotation for place in found])).wxyz

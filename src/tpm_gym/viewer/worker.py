@@ -36,7 +36,7 @@ class Worker:
             self._change.notify_all()
 
     def ask(self, name: str, job: Job) -> None:
-        """Run a job that a user asks for; do nothing if a job has set the control's value."""
+        """Run a job for a user's input; ignore an update that a job of this thread caused."""
         if threading.current_thread() is not self._thread:
             self.put(name, job)
 
@@ -75,7 +75,7 @@ class Worker:
             self._on_error(error)
 
     def _next(self) -> Job | None:
-        """Wait for the next job and take it; None at the end."""
+        """Wait for the next job and remove it from the queue; return None after closing."""
         with self._change:
             self._busy = False
             self._change.notify_all()

@@ -80,7 +80,7 @@ def test_with_free_hands_it_feels_and_sees_what_pybullet_does(policy, rate, boun
     ],
 )
 def test_the_block_goes_where_pybullet_takes_it(policy, median, most):
-    episodes = 6
+    episodes = 12
     states, actions = played(PICK, policy, episodes)
     found = repeated(PICK, actions)
     block = column(states, episodes, "object_position")

@@ -1,10 +1,10 @@
 """Links, joints and loop closures of a Delta, its inertias, and the angles of its passive joints.
 
-A rod has a universal joint at its arm (a small cross between them), so that it cannot spin about
-its own axis, and a ball joint at the platform, which closes a loop. The platform belongs to no leg
-(:func:`tpm_gym.mechanism.parts.free_platform`). The frames of an arm, its crosses and its rods have
-x along the arm or rod and y along the hinges when their joints are at zero; that of the platform is
-parallel to the base's.
+A rod has a universal joint at its arm, with a small cross between them, so that it cannot spin
+about its own axis. A ball joint connects it to the platform and closes a loop. The platform belongs
+to no leg (:func:`tpm_gym.mechanism.parts.free_platform`). When all joints are at zero, the frames
+of an arm, its crosses and its rods have x along the arm and y along the motor's axis. The frame of
+the platform is parallel to the base's.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Inertia(NamedTuple):
 
     Attributes:
         motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
-        weights: For each leg, mass at B_i less ``couples``, kg.
+        weights: For each leg, mass at B_i minus ``couples``, kg.
         couples: For each leg, b of the two bars B_iC_i, kg.
         platform: Mass at P, kg.
         fixed: For each leg, moment of inertia of its crosses about the axis of their swing, kg m^2.
@@ -72,7 +72,7 @@ def build(g: DeltaGeometry, payload: float = 0.0) -> Mechanism:
 
 
 def joint_positions(pose: Pose, theta: Vector, l4: float) -> dict[str, float]:
-    """Compute the positions of all joints, rad or m, from a configuration and its angles."""
+    """Compute the positions of all joints, rad or m, from a configuration and its theta, rad."""
     found = {"cup_slide": 0.0} | dict.fromkeys(parts.TURNS, 0.0)
     found |= dict(zip(parts.SLIDES, map(float, pose.position), strict=True))
     for number, angle, (x, y, z) in zip(LEGS, theta, pose.rods, strict=True):
@@ -119,7 +119,7 @@ def _base(g: DeltaGeometry) -> Link:
 
 
 def _leg(number: int, leg: Pair, g: DeltaGeometry) -> list[Link]:
-    """Build an arm with a short link across, and two rods."""
+    """Build an arm with a short link across its end, two crosses and two rods."""
     arm, pivot = f"arm_{number}", outwards(leg, (g.l1, 0.0, 0.0))
     across = parts.bar("y", g.l5, 0.010, (g.l3, 0.0, 0.0))
     motor = parts.motor(f"R{number}", _MINUS_Y, pivot, level=0.0, sense=1, rpy=_yaw(leg))

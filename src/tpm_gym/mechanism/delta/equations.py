@@ -7,9 +7,9 @@ about the elbow B_i, moved inwards by l2.
 
 * Forward kinematics: P is one of the two points where three spheres intersect.
 * Inverse kinematics: the elbow is one of the two points where a circle and a sphere intersect.
-* Velocity: B_iC_i . v = B_iC_i . dB_i/dtheta_i theta_i', so A v = B theta'. The rods are the rows
-  of A; det A, their volume, is zero at parallel singularities. B is diagonal; its entries are zero
-  at serial singularities.
+* Velocity v of P: B_iC_i . v = B_iC_i . dB_i/dtheta_i theta_i', in short A v = B theta'. The rods
+  are the rows of A; det A is zero at parallel singularities. B is diagonal; one of its entries is
+  zero at a serial singularity.
 * Constraint: each pair of rods keeps the platform from turning about the normal of its plane. Where
   these three normals are coplanar, the platform can turn.
 
@@ -44,7 +44,7 @@ class Pose(NamedTuple):
         bars: Vectors B_iC_i in the base's frame, m.
         parallel: det A, m^3.
         serial: B_iC_i . dB_i/dtheta_i, m^2/rad.
-        constraint: Volume of the normals of the legs' planes, m^3.
+        constraint: Determinant of the normals of the legs' planes, m^3.
     """
 
     cos: Triple
@@ -80,10 +80,11 @@ def outwards(leg: Pair, v: Triple) -> Triple:
 def assembly_at(
     cos: Triple, sin: Triple, side: Numbers, g: AnyDelta, ns: Namespace
 ) -> tuple[Triple, Numbers, Numbers]:
-    """Intersect three spheres, for the sign of det A.
+    """Compute P, one of two points where three spheres intersect, for the sign ``side`` of det A.
 
     Returns:
-        P, m; whether it is real; and the squared distance of P to the plane of the centres, m^2.
+        P, m; whether it is real; and the squared distance of P to the plane of the centres, m^2,
+        which is negative if the spheres do not intersect.
     """
     inner = g.l1 - g.l2
     b1 = outwards(ONE, (inner + cos[0], 0.0, sin[0]))
@@ -93,7 +94,7 @@ def assembly_at(
     b = b3[0] - b1[0], b3[1] - b1[1], b3[2] - b1[2]
     normal = cross(a, b)
     square = dot(normal, normal)
-    # The middle of the circle through the centres, from the first centre
+    # From the first centre to the middle of the circle through all three
     (px, py, pz), (qx, qy, qz) = cross(b, normal), cross(normal, a)
     f, h = dot(a, a) / (2.0 * square), dot(b, b) / (2.0 * square)
     foot = f * px + h * qx, f * py + h * qy, f * pz + h * qz
@@ -127,7 +128,7 @@ def pose_at(theta: Triple, side: Numbers, g: AnyDelta, ns: Namespace) -> tuple[P
 
 
 def pose_of(cos: Triple, sin: Triple, position: Triple, g: AnyDelta) -> Pose:
-    """Compute the configuration from arms (m) and P (m) that fit together."""
+    """Compute the configuration from arms (m) and P (m); the rods have to fit between them."""
     r1 = rod(ONE, position, cos[0], sin[0], g)
     r2 = rod(TWO, position, cos[1], sin[1], g)
     r3 = rod(THREE, position, cos[2], sin[2], g)

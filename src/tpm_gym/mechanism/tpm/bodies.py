@@ -167,9 +167,9 @@ def build(geometry: Geometry = PAPER, payload: float = 0.0) -> Mechanism:
 def joint_angles(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints of :func:`build` with closed loops, rad, by name.
+    """Compute the joint angles (rad) of :func:`build` by name, such that all loops are closed.
 
-    The cup's slide (m) is at rest.
+    The cup's slide is at 0 m.
 
     Raises:
         InputError: If theta (3,) rad has the wrong shape or is not finite.
@@ -228,9 +228,9 @@ def _by_joint(
 ) -> dict[str, FloatArray]:
     """Compute joint angles from the rods 4a, 4b, 6 and 11 (x, y, z) m, and link 7's beta, rad.
 
-    A swing is the angle of a rod in the plane of its arm, and a tilt its elevation out of this
-    plane. A joint angle is the difference to the parent's. ``turn`` is the turn of link 3' and the
-    platform about y; joints turn about -y.
+    A swing is the angle of a rod in the plane of its arm, and a tilt is the rod's elevation out of
+    this plane. A joint angle is a link's angle minus its parent's. ``turn`` (rad) is the rotation
+    of link 3' and the platform about y; joint angles are rotations about -y.
     """
     theta_1, theta_2, theta_3 = theta
     (x_4a, y_4a, z_4a), (x_4b, y_4b, z_4b), (x_6, _, z_6), (x_11, y_11, z_11) = rods

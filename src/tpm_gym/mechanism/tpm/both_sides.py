@@ -30,8 +30,8 @@ Joint positions that are wrong by 1e-4 rad may have no assembly there.
 class BothSides(TPM):
     """TPM that may change to the mirror image of its assembly mode.
 
-    Its region is symmetric about y = 0. Forward kinematics, Jacobian and ``home`` are of its
-    ``assembly_mode``. Modes and conditioning at a position are those of the position's side.
+    Its region is symmetric about y = 0. Forward kinematics, Jacobian and ``home`` belong to its
+    ``assembly_mode``. Functions of a position use the assembly mode of its side of y = 0.
     """
 
     mirror_axis: ClassVar[int] = 1
@@ -39,7 +39,7 @@ class BothSides(TPM):
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
     ) -> NDArray[np.int8]:
-        """See :class:`Machine`; no mode is left next to the plane."""
+        """See :class:`Machine`; the result is 0 next to the plane y = 0."""
         left = super().mode_left(theta, self._own_side(position), built)
         left[np.abs(np.asarray(position)[..., 1]) < _AT_PLANE * self.geometry.l7] = 0
         return left
@@ -70,10 +70,13 @@ class BothSides(TPM):
 
 
 def both_sides(machine: Machine) -> BothSides:
-    """Return a TPM that works on both sides of y = 0, with its region mirrored and joined.
+    """Return a TPM that works on both sides of y = 0.
+
+    Its region is the smallest box around the machine's region and the mirror image of that.
 
     Raises:
-        ConfigurationError: If the machine is no TPM, or its region does not reach to the plane.
+        ConfigurationError: If the machine is no TPM, or not in its modes in the whole region.
+        UnreachableError: If a corner of the region, or next to the plane, cannot be reached.
     """
     if not isinstance(machine, TPM):
         valid = "'paper', 'wide' or another tpm_gym TPM: no singularity divides its region in two"
@@ -82,7 +85,7 @@ def both_sides(machine: Machine) -> BothSides:
     far = max(abs(y) for y in (*ends, *others))
     values = {field.name: getattr(machine, field.name) for field in fields(machine)}
     made = BothSides(**{**values, "region": Region((x, -far, z), (x2, far, z2))})
-    # Next to the plane too, the whole region has to be in one mode.
+    # The region has to be in the machine's modes next to the plane too.
     close = machine.assembly_mode.sin_beta * _AT_PLANE * machine.geometry.l7
     made._require_usable("region", [(a, close, b) for a in (x, x2) for b in (z, z2)])
     return made

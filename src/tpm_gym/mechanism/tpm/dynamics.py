@@ -222,7 +222,7 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
 
 
 def gather(pose: Pose, at_c: _Pair, at_p: Triple) -> Triple:
-    """Compute the torques that balance forces (N) at C1 (x, z) and at P (transposed Jacobians)."""
+    """Compute the motor torques J^T f that balance a force at C1, (x, z) N, and one at P, N."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
     rod3 = (f.cos_beta * py - f.sin_beta * px) * pose.per_k  # its force, over l4

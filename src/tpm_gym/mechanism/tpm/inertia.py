@@ -13,17 +13,17 @@ from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, Z, three
 
 
 class Inertia(NamedTuple):
-    """Constants of the dynamics.
+    """Constants of the dynamics; :mod:`tpm_gym.mechanism.inertia` defines b and swings.
 
     Attributes:
         motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
-        weights: For each leg, mass at B_i less ``couples``, kg.
+        weights: For each leg, mass at B_i minus ``couples``, kg.
         couples: For each leg, b of the bars B_iC_i, kg.
         link3: Mass at C1, kg.
         link7: b of link 7, kg.
         platform: Mass at P, kg.
-        swing1: Swing of leg 1, about the axis x.
-        swing3: Swing of leg 3, about the axis y.
+        swing1: Inertia of the swing of leg 1, about x.
+        swing3: Inertia of the swing of leg 3, about y.
     """
 
     motors: Triple

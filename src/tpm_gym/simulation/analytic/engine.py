@@ -38,9 +38,10 @@ from tpm_gym.simulation.state import Scene
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _NEAR_PLANE = 1.2
-"""Distance from a plane of symmetry, in step limits, above which differences give the torques.
+"""Distance from the plane of ``mirror_axis``, divided by the machine's step limit.
 
-There, the acceleration normal to the plane has an error of 0.2 m/s^2 at full speed.
+Beyond this distance, torques are computed from differences of joint positions. At this distance,
+their error is 0.2 m/s^2 in the acceleration normal to the plane, at full speed.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -87,7 +88,7 @@ class AnalyticEngine:
         self._tail = {"none": 2, "last": 3, "every": 0}[self.physics.torques]
         self._draws = "pybullet" if find_spec("pybullet") else "mujoco"
         self._artist: Engine | None = None
-        self._mirrored: Engine | None = None  # poses a robot beyond its plane for the artist
+        self._mirrored: Engine | None = None  # poses a robot beyond the plane
         self.torques: FloatArray | None = None
 
     def load(self, machine: Machine, scene: Scene, count: int) -> None:
@@ -113,7 +114,7 @@ class AnalyticEngine:
         self._rates, self._torque, self._force = np.zeros((3, count, 3))
         self._carried, self._no_push = np.zeros(count), np.zeros((count, 1, 3))  # kg, N
         self._mode_left = np.zeros(count, dtype=np.int8)
-        self._behind = np.zeros(count, dtype=np.bool_)  # whether an ideal motor lacked torque
+        self._behind = np.zeros(count, dtype=np.bool_)  # whether an ideal motor was at its limit
         if self._gui:
             self._artist = self._new_artist()
 
@@ -192,9 +193,10 @@ class AnalyticEngine:
             self._repeat(rows, start, path, vacuum)
 
     def _near_plane(self, axis: int, path: Path) -> BoolArray:
-        """Return whether the path is near the plane, or P is beyond it, (n,).
+        """Return whether P or its path is near the plane, or the path goes to its other side, (n,).
 
-        Near the plane, differences of the joint positions do not give the torques.
+        There, differences of the joint positions do not give the torques. True for all robots if
+        any robot has had encoder bias or length errors.
         """
         if not self._exact:
             return np.ones(self._count, dtype=np.bool_)
@@ -208,7 +210,7 @@ class AnalyticEngine:
         for name, values in start.items():
             getattr(self, name)[rows] = values[rows]
         self._contact.undo(rows)
-        joints = np.ascontiguousarray(path.joints()[rows].swapaxes(0, 1))
+        joints = np.ascontiguousarray(path.take(rows).joints().swapaxes(0, 1))
         steps = IdealSteps(joints, self._effort[rows], self.time_step)
         self._integrate(rows, steps, len(path.weights), vacuum)
         self._behind[rows] = steps.behind
@@ -228,7 +230,7 @@ class AnalyticEngine:
 
         course = Course(*(getattr(self, name)[rows] for name in _COURSE))
         built = None if self._built is None else self._built[rows]
-        # A machine with a plane has ideal drives: ServoDrives refuses it.
+        # pass_through() needs ideal drives; ServoDrives rejects machines with a mirror_axis.
         go: Any = march if self._machine.mirror_axis is None else pass_through
         course, torques = go(self._machine, built, steps, count, course, self.time_step, touch)
         for name, values in zip(_COURSE, course, strict=True):
@@ -269,7 +271,8 @@ class AnalyticEngine:
         over = loops().beyond(last, _CHECK_ABOVE * self._effort)
         rows = np.flatnonzero(over)
         if len(rows):
-            whole = np.concatenate([*lead, path.joints()], axis=1)[rows]
+            before = [part[rows] for part in lead]
+            whole = np.concatenate([*before, path.take(rows).joints()], axis=1)
             torques = self._torques(rows, whole, push[rows])
             over[rows] = loops().beyond(torques, self._effort[rows])
         return over

@@ -1,9 +1,10 @@
 """Forward dynamics of P, for machines that may pass a parallel singularity.
 
-In the plane of the singularity, the inertia at the motors' axes is infinite. The inertia of P is
-not: with theta_dot = K v, it is K^T M K, which is even and smooth in the distance from the plane.
-So here the velocity of P is integrated instead of the joint velocities. In the plane, the column of
-K that is normal to the plane is zero: the motors do not act along it, and P coasts.
+In the plane of the singularity, the inertia M at the motors' axes is infinite. The inertia of P is
+finite: it is K^T M K, where K is the inverse Jacobian, theta_dot = K v, and v is the velocity of P.
+It changes smoothly with the distance from the plane, and is equal on both sides. So this module
+integrates v, not the joint velocities. In the plane, the column of K for the direction normal to
+the plane is zero. There, the motors cannot accelerate P in this direction, and P keeps its speed.
 """
 
 from __future__ import annotations
@@ -18,16 +19,17 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, Touch
 
 _LIFT: Final = 5e-5
-"""Distance from the plane, m, within which inertia and forces are those at this distance.
+"""Smallest distance from the plane, m, at which inertia and forces are computed.
 
-They change with its square. Closer to the plane, rounding would be larger.
+Closer to the plane, the values at this distance are used. They change with the square of the
+distance, so the error is smaller than the rounding errors at the true distance.
 """
 _BESIDE: Final = 1e-4
-"""Distance, m, of the points from which the second derivative of the joint positions is found."""
+"""Distance of P, m, to two points whose joint positions give the second derivative at P."""
 _COMPLIANCE: Final = 1e-8
-"""Compliance of ideal motors, as a share of the trace of the inverse inertia at their axes.
+"""Compliance of ideal motors, as a fraction of the trace of the inverse inertia at their axes.
 
-It keeps their torques defined in the plane, where the motors' limits bound them.
+In the plane, the inverse inertia is singular. With the compliance, the torques are still unique.
 """
 
 
@@ -35,9 +37,9 @@ class _Dynamics(NamedTuple):
     """Dynamics of P: mass dv/dt + bias = rate^T torque, with theta_dot = rate v.
 
     Attributes:
-        rate: K, (r, 3, 3) rad/m.
+        rate: Inverse Jacobian K, (r, 3, 3) rad/m.
         inverse: Inverse of the mass, (r, 3, 3) 1/kg.
-        bias: Force for weight and velocity, (r, 3) N.
+        bias: Force that carries the weight and the velocity-dependent loads, (r, 3) N.
     """
 
     rate: FloatArray
@@ -46,14 +48,15 @@ class _Dynamics(NamedTuple):
 
 
 class _Lifted(NamedTuple):
-    """Kinematics beside points, on the side of the machine's home.
+    """Kinematics at points that are moved to the side of the machine's home.
 
     Attributes:
-        points: Mirrored points, (r, 3) m.
+        points: Mirrored points, at least _LIFT from the plane, (r, 3) m.
         side: 1, or -1 for the mirrored component, (r, 3).
         theta: Joint positions at ``points``, (r, 3) rad.
-        own_rate: K at ``points``, (r, 3, 3) rad/m, with theta_dot = K v.
-        rate: K at the points themselves, whose column normal to the plane grows with the distance.
+        own_rate: Inverse Jacobian K at ``points``, (r, 3, 3) rad/m, with theta_dot = K v.
+        rate: K at the original points, (r, 3, 3) rad/m. Its column for the direction normal to the
+            plane is proportional to the distance from the plane.
     """
 
     points: FloatArray
@@ -74,12 +77,12 @@ def pass_through(
 ) -> tuple[Course, FloatArray]:
     """Compute ``count`` time steps of r robots with ideal drives.
 
-    Arguments and results are explained in :func:`tpm_gym.simulation.analytic.march`.
+    Arguments and results are explained in :func:`.forward_dynamics.march`.
     """
     torques = np.empty((count, *course.theta.shape))
     speed = (course.position - course.before) / step
     for index in range(count):
-        # K, and so the change of the joint positions, is accurate in the middle of the time step.
+        # K in the middle of the time step gives accurate changes of the joint positions.
         at = _dynamics(machine, built, course.position + step / 2 * speed, speed, course.carried)
         free = speed + step * _times(at.inverse, course.force - at.bias)
         inverse = at.rate @ at.inverse @ at.rate.swapaxes(1, 2)

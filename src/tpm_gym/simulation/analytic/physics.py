@@ -15,12 +15,13 @@ class Physics(Numerics):
     """Numerical settings of the analytic engine.
 
     Attributes:
-        time_step: Time step, s; the control period must be an integer multiple of it, at least 3.
+        time_step: Time step, s; the control period must have a whole number of time steps, 3 or
+            more.
         torques: Time steps in which the torques of ideal motors are computed and compared with
-            their largest torques: ``"none"`` (torques in the State are NaN and have no limit),
-            ``"last"`` of a control period, or ``"every"``. With ``"last"``, all time steps are
-            computed if the last torque is above half of a motor's largest torque. Servo drives
-            always compute all torques.
+            their largest torques: ``"none"`` (no limit, and NaN in the State, except for robots
+            that need forward dynamics), ``"last"`` of a control period, or ``"every"``. With
+            ``"last"``, all time steps are computed if the last torque is above half of a motor's
+            largest torque. Servo drives always compute all torques.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -99,8 +99,8 @@ def ideal_push(
 
     Args:
         theta: (r, 3) rad, joint positions at the beginning of the time step.
-        rates: (r, 3) rad/s, joint velocities at its end without torques.
-        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes, with their compliance.
+        rates: (r, 3) rad/s, joint velocities at the end of the time step without torques.
+        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes plus their compliance.
         torque: (r, 3) N m, output.
     """
     for row in range(len(effort)):
@@ -210,8 +210,8 @@ def modes_left(
 ) -> tuple[NDArray[np.int8], bool]:
     """Return the mode that each robot has left (r,), and whether any robot has left one.
 
-    Beyond a parallel singularity the joints turn back, so that forward kinematics still return a
-    position, but of the wrong assembly. Only ``side`` detects this.
+    When P passes a parallel singularity, the joints reverse. So forward kinematics still return a
+    position, but in the wrong assembly mode. Only ``side`` detects this.
 
     Args:
         position: (r, 3) m, P by forward kinematics; NaN if there is no assembly.
@@ -236,7 +236,7 @@ def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
     """Compute the joint velocities u after an impulse, with Coulomb friction.
 
     mass u = impulse - resistance. The resistance is limit sign(u), or at most limit if u is zero.
-    So u minimises u mass u / 2 - impulse u + limit |u|.
+    So u minimises u mass u / 2 - impulse u + limit |u|, summed over the joints.
 
     Args:
         mass: Inertia, kg m^2.
@@ -273,7 +273,7 @@ def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> V
 def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
     """Find x within +-most that minimises x matrix x / 2 - wanted x.
 
-    The minimum has some entries at a bound, and is stationary in the others.
+    At the minimum, some entries are at a bound, and the cost is stationary in the others.
     """
     found, best = _ZERO, np.inf
     for choice in range(27):  # all combinations of no bound, upper bound and lower bound

@@ -63,11 +63,11 @@ class BulletEngine:
         self.time_step = self.physics.time_step
         self._renderer, self._servo = renderer, drive
         self._drives: ServoDrives | None = None
-        # Torques at rest and of servo drives, for which Bullet reports zero after a restore, or the
-        # joint friction. None: use Bullet's torques.
+        # Torques that read() returns, N m; None for the torques that Bullet reports. Bullet reports
+        # zero after a restore, and the joint friction with servo drives.
         self._torque: Vector | None = _ZERO
-        # What was restored last, until the robot moves. Bullet normalises quaternions, so that
-        # reading them again could give other bits.
+        # Snapshot that was restored last; None as soon as the robot moves. save() returns it again,
+        # because Bullet normalises quaternions, so that reading them could give other bits.
         self._restored: _Saved | None = None
         self.client = Client(self.physics, renderer=renderer)
         self._window: Window | None = None
@@ -106,7 +106,7 @@ class BulletEngine:
         (plant,) = plants
         if plant.length_errors != self._plant.length_errors:
             self.client.close()
-            self.client = Client(self.physics, renderer=self._renderer)  # leaks less than a reset
+            self.client = Client(self.physics, renderer=self._renderer)  # a reset leaks more
             self._load(plant.of(self._nominal))
         self._plant = plant
         self.robot.alter(plant.link_masses, plant.motor_strength)
@@ -132,7 +132,7 @@ class BulletEngine:
         self._scenery.belt_speed = float(speed[0])
         self._friction.set_belt(float(speed[0]))
         if not speed[0]:
-            self._scenery.run_belts()  # stops them; advance() leaves belts at rest alone
+            self._scenery.run_belts()  # stop them here: advance() skips belts at rest
 
     def advance(self, path: Path, vacuum: BoolArray) -> None:
         """Implement :meth:`Engine.advance`."""

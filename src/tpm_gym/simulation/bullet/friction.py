@@ -6,17 +6,18 @@ oppose the slip. On a level face the directions are the world's x and y, and Bul
 limits for each body. For a slipping contact, this module scales them so that a corner of the box
 lies on the cone, opposite to the slip. For a sticking contact, the limit along x follows from the
 cone and the last force along y, and vice versa. Without a last force, the box lies inside the cone.
-An object at rest that the lip comes near is expected to slip along the lip's way.
+
+**Slides.** All points of a contact share these scales, and contacts between objects have none. So
+this module adds the friction that was missing in the last time step, as a force and a torque: mu N
+against the slip of each point, less the solver's friction.
 
 **Upright faces.** The solver takes N from a solution without friction. But a block that the lip
 pushes leans on the lip only because the table brakes it. Without friction N is 0, and the lip would
 be as slippery as ice. So this module adds the missing friction as a force, from the last N.
 
 Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
-by one time step. The smaller scale never falls below :data:`_LEAST`. All points of a contact share
-the mean of their scales. So friction brakes too little the spin of a block, and the sideways motion
-of a block that spins and slides. Contacts between objects keep the box, and upright ones have no
-friction in a steady push.
+by one time step. The smaller scale never falls below :data:`_LEAST`. Level contacts between objects
+keep the box where they stick, and all of them in the first time step of a slide.
 """
 
 from __future__ import annotations
@@ -44,9 +45,17 @@ _SAME = 0.003  # a smaller change of a scale is ignored, to save a call
 _LEVEL = 0.7  # z of the normal; faces with less are upright
 _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction of the force
 _BOX = (1.0, 1.0)  # Bullet's default scales
+_NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
 """Sum of the forces that were added to a contact, and its largest friction at last, N."""
-_NONE: _Push = ((0.0, 0.0, 0.0), 0.0)
+_ZERO: Vector = (0.0, 0.0, 0.0)
+_NONE: _Push = (_ZERO, 0.0)
+_Slip = tuple[float, float, float, float]
+"""Slip of a contact point (x, y, z), and its speed, m/s."""
+_Wrench = tuple[float, float, float, float, float, float]
+"""Force (x, y, z) N, and torque (x, y, z) N m about an object's centre."""
+_Lacks = dict[tuple[int, int], _Wrench]
+"""Friction that the solver left out in a time step, of pairs of bodies that slide on each other."""
 
 
 class _Face:
@@ -61,35 +70,25 @@ class _Face:
 
 
 class _Motion(NamedTuple):
-    """Place (m), velocity (m/s) and angular velocity (rad/s) of an object."""
+    """Place (m), velocity (m/s) and angular velocity (rad/s) of a link of a body.
 
+    Forces move the body only if it is free.
+    """
+
+    body: int
+    link: int
     place: Vector
     velocity: Vector
     turning: Vector
+    free: bool
 
-    @classmethod
-    def of(cls, body: int, number: int) -> _Motion:
-        """Read the motion of a body."""
-        place, _ = pybullet.getBasePositionAndOrientation(body, number)
-        return cls(place, *pybullet.getBaseVelocity(body, number))
-
-    def slip(
-        self, other: tuple[float, float], points: Sequence[Any]
-    ) -> tuple[tuple[float, float], float]:
-        """Return the scales for the slip of contact points, and its mean speed in m/s.
-
-        Points of a spinning object slip in different directions, but share the scales.
-        """
-        (x, y, z), (u, v, _), (p, q, r) = self
-        along_x = along_y = speed = total = 0.0
-        for point in points:
-            (a, b, c), weight = point[5], max(point[9], 1e-9)
-            slip_x = u - other[0] + q * (c - z) - r * (b - y)
-            slip_y = v - other[1] + r * (a - x) - p * (c - z)
-            scale_x, scale_y = _along(slip_x, slip_y)
-            along_x, along_y = along_x + weight * scale_x, along_y + weight * scale_y
-            speed, total = speed + weight * math.hypot(slip_x, slip_y), total + weight
-        return (along_x / total, along_y / total), speed / total
+    def at(self, point: Vector) -> Vector:
+        """Compute the velocity of a point of the body, m/s."""
+        if self.turning is _ZERO:
+            return self.velocity
+        (x, y, z), (u, v, w), (p, q, r), (a, b, c) = self.place, self.velocity, self.turning, point
+        x, y, z = a - x, b - y, c - z
+        return u + q * z - r * y, v + r * x - p * z, w + p * y - q * x
 
 
 class Friction:
@@ -126,14 +125,18 @@ class Friction:
         self._number, self._factor = number, 1.0
         self._step = time_step
         self._friction_force = loops().friction_force
-        self._pushes: list[_Push] = []
+        self._pushes: dict[tuple[int, int], _Push] = {}  # of the last time step
+        self._pushed: dict[tuple[int, int], _Push] = {}  # of the one before
+        self._lacks: _Lacks = {}  # of the last time step
+        self._lacked: _Lacks = {}  # of the one before
         self._active: list[int] = []
+        self._held = -1  # body id of the held object
         self._resting: set[int] = set()
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
         """Set the scales of all faces to an unknown direction of the force."""
-        self._pushes = [_NONE] * len(self._bodies)
+        self._pushes, self._lacks = {}, {}
         for face in (self._cup, *self._belts, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet
             self._set(face, _UNKNOWN)
@@ -165,6 +168,8 @@ class Friction:
             if not settles and math.hypot(x, y, z) > _SLIP:
                 moving.append(index)
         self._active = sorted({*moving, *near}) if moving else list(near)
+        if not moving:
+            self._pushes, self._lacks = {}, {}
         # A single object rests until the cup touches it. Several objects may push each other.
         alone = len(self._bodies) == 1
         self._resting = set(near).difference(moving) if alone else set()
@@ -172,70 +177,132 @@ class Friction:
 
     def scale(self, held: int) -> None:
         """Scale the friction of objects that may slip; call before each time step."""
-        number, cup = self._number, self._cup
+        self._held = self._bodies[held][0] if held >= 0 else -1
+        self._pushed, self._pushes = self._pushes, {}
+        self._lacked, self._lacks = self._lacks, {}
         for index in self._active:
-            body, table, block = self._bodies[index]
-            push, self._pushes[index] = self._pushes[index], _NONE
+            body, table, _ = self._bodies[index]
             if index != held and self._rests(index):
-                u, v, _ = self._lip_velocity()
-                if math.hypot(u, v) > _FAST:  # a strike would make the object slip along (u, v)
-                    self._set(table, _along(u, v))
-                    self._set(cup, _BOX)
-                continue
-            points = pybullet.getContactPoints(body, -1, -2, -2, number)  # with all other bodies
-            if not points:
-                continue
-            below = [point for point in points if point[2] == table.body]
-            lip = [point for point in points if point[2] == cup.body and point[4] == cup.link]
-            beside = [point for point in lip if abs(point[7][2]) < _LEVEL]
-            rough, motion = self._factor * block.friction, _Motion.of(body, number)
-            if below:
-                self._set(table, _scales(motion, (0.0, 0.0), below, rough))
-            if self._belts:
-                belt = self._belts[index]
-                if on_belt := [point for point in points if point[2] == belt.body]:
-                    self._set(belt, _scales(motion, (belt.speed, 0.0), on_belt, rough))
-            if beside:
+                u, v, _ = self._lip().velocity
+                if math.hypot(u, v) > _FAST:  # a strike may make the object slip in any direction
+                    self._set(table, _UNKNOWN)
+                    self._set(self._cup, _BOX)
+            # with all other bodies
+            elif points := pybullet.getContactPoints(body, -1, -2, -2, self._number):
+                self._scale_at(index, points, index == held)
+
+    def _scale_at(self, index: int, points: Sequence[Any], held: bool) -> None:
+        """Scale the friction of an object at its contact points, and add what was missing."""
+        (body, table, block), cup = self._bodies[index], self._cup
+        rough, motion = self._factor * block.friction, self._motion(body)
+        if below := [point for point in points if point[2] == table.body]:
+            self._slide(motion, _surface(table), below, rough, table)
+        if self._belts:
+            belt = self._belts[index]
+            if on_belt := [point for point in points if point[2] == belt.body]:
+                self._slide(motion, _surface(belt), on_belt, rough, belt)
+        if lip := [point for point in points if point[2] == cup.body and point[4] == cup.link]:
+            if _beside(lip):
                 self._set(cup, _BOX)
-                coefficient = rough * CUP.friction
-                self._pushes[index] = self._resist(body, motion, beside, push, coefficient)
-            elif lip and index != held:
-                u, v, _ = self._lip_velocity()
-                self._set(cup, _scales(motion, (u, v), lip, rough * CUP.friction))
+                self._resist(motion, self._lip(), lip, rough * CUP.friction)
+            elif not held:
+                self._slide(motion, self._lip(), lip, rough * CUP.friction, cup)
+        for other, (their, _, their_block) in enumerate(self._bodies):
+            between = [point for point in points if point[2] == their]
+            if between and (other > index or other not in self._active):  # once for both
+                coefficient = rough * self._factor * their_block.friction
+                add = self._resist if _beside(between) else self._slide
+                add(motion, self._motion(their), between, coefficient)
 
-    def _lip_velocity(self) -> Vector:
-        state = pybullet.getLinkState(self._cup.body, self._cup.link, 1, 0, self._number)
-        return state[6]  # type: ignore[no-any-return]  # PyBullet has no types
+    def _motion(self, body: int) -> _Motion:
+        place, _ = pybullet.getBasePositionAndOrientation(body, self._number)
+        velocity, turning = pybullet.getBaseVelocity(body, self._number)
+        return _Motion(body, -1, place, velocity, turning, free=True)
 
-    def _resist(
-        self, body: int, motion: _Motion, points: Sequence[Any], last: _Push, coefficient: float
-    ) -> _Push:
-        """Apply the friction that the solver leaves out where the lip pushes a side of an object.
+    def _lip(self) -> _Motion:
+        body, link = self._cup.body, self._cup.link
+        state = pybullet.getLinkState(body, link, 1, 0, self._number)
+        return _Motion(body, link, state[0], state[6], _ZERO, free=True)  # it does not turn
 
-        The points count as one contact at the point with the largest force. A blow lasts one time
-        step, and pushes no more in the next. So the smaller force of two time steps counts.
+    def _slide(
+        self,
+        motion: _Motion,
+        other: _Motion,
+        points: Sequence[Any],
+        coefficient: float,
+        face: _Face | None = None,
+    ) -> None:
+        """Scale the friction of a face, and add the friction that the last time step left out.
+
+        A blow lasts one time step, and in the next its friction is missing no more. The friction of
+        a slip that turns round is missing no more, either. So the smaller of two time steps counts.
 
         Args:
-            body: Body id of the object.
             motion: Motion of the object.
+            other: Motion of what it touches.
             points: PyBullet's contact points.
-            last: The last push.
+            coefficient: Coulomb's coefficient.
+            face: Face of the other body; None for an object.
+        """
+        slips = [_slip(motion, other, point) for point in points]
+        if face is not None:
+            self._set(face, _scales(slips, points, coefficient))
+        # Rigid, the forces on a held object are not determined, so that N has no meaning there.
+        if motion.body == self._held or max(slip[3] for slip in slips) <= _FAST:
+            return
+        pair, lack = (motion.body, other.body), _lack(motion, slips, points, coefficient)
+        self._lacks[pair] = lack
+        if pair in self._lacked:
+            x, y, z, p, q, r = map(_smaller, self._lacked[pair], lack)
+            if max(map(abs, (x, y, z, p, q, r))) > _NOTHING:
+                self._push(motion, other, motion.place, (x, y, z), (p, q, r))
+
+    def _push(
+        self, motion: _Motion, other: _Motion, at: Vector, force: Vector, torque: Vector = _ZERO
+    ) -> None:
+        """Apply a force (N) at a point (m) and a torque (N m), and the reaction to the other."""
+        number, frame = self._number, pybullet.WORLD_FRAME
+        for pushed, sign in ((motion, 1.0), (other, -1.0)):
+            if pushed.free:
+                x, y, z = force
+                push, (p, q, r) = (sign * x, sign * y, sign * z), torque
+                pybullet.applyExternalForce(pushed.body, pushed.link, push, at, frame, number)
+                if torque is not _ZERO:
+                    turn = sign * p, sign * q, sign * r
+                    pybullet.applyExternalTorque(pushed.body, pushed.link, turn, frame, number)
+
+    def _resist(
+        self, motion: _Motion, other: _Motion, points: Sequence[Any], coefficient: float
+    ) -> None:
+        """Apply the friction that the solver leaves out where an object's side is pushed.
+
+        The upright points count as one contact at the point with the largest force. A blow lasts
+        one time step, and pushes no more in the next. So the smaller of two time steps counts.
+
+        Args:
+            motion: Motion of the object.
+            other: Motion of the lip or object that pushes it.
+            points: PyBullet's contact points.
             coefficient: Coulomb's coefficient of the contact.
         """
-        number, cup, point = self._number, self._cup, max(points, key=lambda point: point[9])
+        points = _beside(points)
+        point = max(points, key=lambda point: point[9])
         normal = sum(point[9] for point in points)
         solved = sum(math.hypot(point[10], point[12]) for point in points)
-        mass, _, moments, *_ = pybullet.getDynamicsInfo(body, -1, number)
         most = coefficient * normal - solved
-        contact, moving = (point[5], point[7], motion.place), (*motion[1:], self._lip_velocity())
-        before, limit = last[0], min(last[1], most)
+        pair, moving = (motion.body, other.body), (*motion[3:5], other.at(point[5]))
+        before, limit = self._pushed.get(pair, _NONE)
+        mass, _, moments, *_ = pybullet.getDynamicsInfo(motion.body, -1, self._number)
+        if other.link < 0:  # an object gives way
+            theirs = pybullet.getDynamicsInfo(other.body, -1, self._number)[0]
+            share = theirs / (mass + theirs)
+            mass, moments = share * mass, tuple(share * moment for moment in moments)
         force, after = self._friction_force(
-            *contact, moving, before, limit, mass, moments, self._step
-        )
-        x, y, z = force
-        for pushed, push in (((body, -1), force), ((cup.body, cup.link), (-x, -y, -z))):
-            pybullet.applyExternalForce(*pushed, push, point[5], pybullet.WORLD_FRAME, number)
-        return after, most
+            point[5], point[7], motion.place, moving, before, min(limit, most), mass, moments,
+            self._step,
+        )  # fmt: skip
+        self._push(motion, other, point[5], force)
+        self._pushes[pair] = after, most
 
     def _rests(self, index: int) -> bool:
         """Return whether an object has not moved since :meth:`prepare`, and the cup is not on it.
@@ -261,26 +328,94 @@ class Friction:
             self._scale(face.body, face.link, anisotropicFriction=(a, b, 1.0))
 
 
-def _scales(
-    motion: _Motion, other: tuple[float, float], points: Sequence[Any], coefficient: float
-) -> tuple[float, float]:
-    """Return the friction limits along x and y (world) in units of mu N.
+def _beside(points: Sequence[Any]) -> list[Any]:
+    """Return the contact points at upright faces."""
+    return [point for point in points if abs(point[7][2]) < _LEVEL]
+
+
+def _surface(face: _Face) -> _Motion:
+    return _Motion(face.body, face.link, _ZERO, (face.speed, 0.0, 0.0), _ZERO, free=False)
+
+
+def _slip(motion: _Motion, other: _Motion, point: Any) -> _Slip:
+    (u, v, w), (p, q, r), (a, b, c) = motion.at(point[5]), other.at(point[5]), point[7]
+    u, v, w = u - p, v - q, w - r
+    along = u * a + v * b + w * c
+    u, v, w = u - along * a, v - along * b, w - along * c
+    return u, v, w, math.sqrt(u * u + v * v + w * w)
+
+
+def _lack(
+    motion: _Motion, slips: Sequence[_Slip], points: Sequence[Any], coefficient: float
+) -> _Wrench:
+    """Compute Coulomb's friction of the points that slip, less the solver's.
 
     Args:
         motion: Motion of the object.
-        other: Velocity of the other body along x and y, m/s.
+        slips: Slip of each point.
+        points: PyBullet's contact points, with the forces of the last time step.
+        coefficient: Coulomb's coefficient.
+    """
+    solved = [_solved(point) for point in points]
+    # PyBullet returns the friction on either body. It opposes the slip.
+    power = sum(
+        f * u + g * v + h * w for (f, g, h), (u, v, w, _) in zip(solved, slips, strict=True)
+    )
+    sign = -1.0 if power > 0 else 1.0
+    fx = fy = fz = tx = ty = tz = 0.0
+    for own, (u, v, w, speed), point in zip(solved, slips, points, strict=True):
+        if speed > _FAST:
+            (a, b, c), (i, j, k), share = motion.place, point[5], coefficient * point[9] / speed
+            x, y, z = (
+                -share * u - sign * own[0],
+                -share * v - sign * own[1],
+                -share * w - sign * own[2],
+            )
+            fx, fy, fz = fx + x, fy + y, fz + z
+            tx += (j - b) * z - (k - c) * y
+            ty += (k - c) * x - (i - a) * z
+            tz += (i - a) * y - (j - b) * x
+    return fx, fy, fz, tx, ty, tz
+
+
+def _solved(point: Any) -> Vector:
+    """Return the solver's friction at a point, N."""
+    first, (a, b, c), second, (d, e, f) = point[10:]
+    return first * a + second * d, first * b + second * e, first * c + second * f
+
+
+def _smaller(one: float, other: float) -> float:
+    """Return the number that is nearer to zero; zero if the signs differ."""
+    return math.copysign(min(abs(one), abs(other)), one) if one * other > 0 else 0.0
+
+
+def _scales(
+    slips: Sequence[_Slip], points: Sequence[Any], coefficient: float
+) -> tuple[float, float]:
+    """Return the friction limits along x and y (world) in units of mu N.
+
+    Points of a spinning object slip in different directions, but share the scales.
+
+    Args:
+        slips: Slip of each point.
         points: PyBullet's contact points.
         coefficient: Coulomb's coefficient.
     """
-    (x, y), speed = motion.slip(other, points)
-    if speed > _FAST:
-        return x, y
+    along_x = along_y = speed = total = 0.0
+    for (x, y, _, fast), point in zip(slips, points, strict=True):
+        weight = max(point[9], 1e-9)
+        scale_x, scale_y = _along(x, y)
+        along_x, along_y = along_x + weight * scale_x, along_y + weight * scale_y
+        speed, total = speed + weight * fast, total + weight
+    mean = along_x / total, along_y / total
+    if speed > _FAST * total:
+        return mean
     a, b = _used(points, coefficient)
     if a * a + b * b < _LITTLE:
         return _UNKNOWN
     if a * a + b * b < _STICKS:
         return math.sqrt(1 - b * b), math.sqrt(1 - a * a)
-    return (x, y) if speed > _SLIP else _along(a, b)
+    return mean if speed > _SLIP * total else _along(a, b)
 
 
 def _along(x: float, y: float) -> tuple[float, float]:
@@ -291,11 +426,6 @@ def _along(x: float, y: float) -> tuple[float, float]:
 
 def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
     """Return the sum of friction forces along the world's x and y, in units of mu N."""
-    along_x = along_y = normal = 0.0
-    for point in points:
-        force, first, (a, b, _), second, (c, d, _) = point[9:]
-        along_x += first * a + second * c
-        along_y += first * b + second * d
-        normal += force
-    most = coefficient * normal
+    along_x, along_y, _ = map(sum, zip(*map(_solved, points), strict=True))
+    most = coefficient * sum(point[9] for point in points)
     return (along_x / most, along_y / most) if most > 0 else (0.0, 0.0)

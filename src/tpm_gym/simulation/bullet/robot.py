@@ -3,7 +3,7 @@
 Each leg of the spanning tree is loaded as a separate multibody, so that every loop closure joins
 two multibodies. With a closure inside one multibody, Bullet's direct solvers compute wrong forces
 and the loop opens at once; between multibodies they are exact (docs/fidelity.md). Separate
-multibodies also shorten every row of the solver.
+multibodies also make the solver's rows shorter.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Address = tuple[int, int]
 _CLOSURE_FORCE = 1e6  # N; so large that no load opens a loop
 
 
-# Writing it takes a quarter of the time of loading.
+# The text is kept, because writing it takes a quarter of the time of loading a robot.
 _urdf_text = lru_cache(maxsize=16)(urdf.urdf_text)
 
 

@@ -50,7 +50,7 @@ class Scenery:
         tables: Body ids of the tables. Each object collides with its own table, because
             :class:`Friction` scales the friction of each table. All tables are in one place and
             have one colour. The first table exists also without objects.
-        belts: Body ids of the belts, likewise; empty without a belt.
+        belts: Body ids of the belts, one for each table; empty without a belt.
         belt_speed: Speed of the belts along x, m/s.
     """
 
@@ -91,7 +91,7 @@ class Scenery:
     def _add_box(
         self, half: Vector, place: Vector, colour: Sequence[float], mass: float = 0.0
     ) -> int:
-        """Add a box with its middle at ``place`` (m), static without mass."""
+        """Add a box with its centre at ``place`` (m); a box without mass is static."""
         client = self._client
         solid = client.createCollisionShape(client.GEOM_BOX, halfExtents=half)
         shape = client.createVisualShape(client.GEOM_BOX, halfExtents=half, rgbaColor=colour)
@@ -112,7 +112,8 @@ class Scenery:
     def run_belts(self) -> None:
         """Set place and velocity of the belts; call before each time step.
 
-        Contacts see the velocity of a static body's base. But Bullet moves the body, too.
+        A belt is a static body with a velocity, so that contacts carry blocks along. Bullet also
+        moves the body by this velocity; therefore the place is set each time.
         """
         for belt, place in zip(self.belts, self._belt_places, strict=True):
             self._client.resetBasePositionAndOrientation(belt, *place)

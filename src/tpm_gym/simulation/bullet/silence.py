@@ -12,9 +12,12 @@ _lock = threading.RLock()
 
 @contextmanager
 def silence(descriptor: int = 1) -> Iterator[None]:
-    """Discard what Python and C code print within the context: standard output, or 2 for errors.
+    """Discard what Python and C code print within the context.
 
     This affects the whole process. So a lock admits only one thread at a time.
+
+    Args:
+        descriptor: File descriptor: 1 is the standard output, 2 the standard error.
     """
     with _lock:
         try:

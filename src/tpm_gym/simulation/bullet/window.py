@@ -18,7 +18,7 @@ from tpm_gym.simulation.imaging import Camera
 from tpm_gym.simulation.stage import MARKER_COLOUR
 from tpm_gym.simulation.state import Scene
 
-_CLOSER = 0.42  # factor of distances: the window's field of view is fixed at 90 degrees
+_CLOSER = 0.42  # factor of the camera's distance, for the window's field of view: always 90 degrees
 _OFF = (
     pybullet.COV_ENABLE_GUI,  # side panels
     pybullet.COV_ENABLE_RGB_BUFFER_PREVIEW,

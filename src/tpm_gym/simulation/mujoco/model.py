@@ -34,7 +34,7 @@ from tpm_gym.simulation.state import Block, Scene
 
 _RECOVERY = 0.1
 """Fraction of a penetration that a contact removes per time step; 0.1 causes the least bouncing."""
-_MARGIN = 1e-6  # m; so an object placed exactly on the table has contact in the first time step
+_MARGIN = 1e-6  # m; gives an object placed exactly on the table a contact in the first time step
 
 
 def compile_model(machine: Machine, scene: Scene, physics: Physics) -> mujoco.MjModel:
@@ -110,7 +110,7 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
     for slab, low, high in boards(machine.table, scene.belt):
         size = (high - low) / 2, machine.table[1], slab.half_height
         pos = (low + high) / 2, 0.0, slab.top - slab.half_height
-        # Without a velocity in the file, MuJoCo would leave out the computation for good.
+        # Without a velocity in the XML, the compiled model would ignore the belt's speed.
         names = {"name": "table"} if slab is TABLE else {"name": "belt", "surfacevel": "1 0 0"}
         _geom(world, "box", size, slab.colour, pos=pos, **names)
     for patch in painted(scene):

@@ -16,7 +16,8 @@ class Physics(Numerics):
     Attributes:
         time_step: Time step, s; the control period must be an integer multiple of it.
         iterations: Largest number of iterations of the solver (Newton's method) per time step.
-        tolerance: The solver stops when an iteration improves the cost by less (MuJoCo's unit).
+        tolerance: The solver stops when an iteration improves its cost by less than this value, in
+            MuJoCo's unit.
 
     Raises:
         ConfigurationError: If a value is out of range.

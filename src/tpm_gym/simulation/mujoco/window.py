@@ -16,7 +16,9 @@ from tpm_gym.simulation.stage import MARKER_COLOUR
 
 
 class Window:
-    """Viewer that opens when it first shows something, and stays closed once the user closes it.
+    """Viewer that opens at the first call of :meth:`show`, and for each new model.
+
+    After the user has closed it, it stays closed until the model changes.
 
     Raises:
         ConfigurationError: If no window can open.
@@ -63,7 +65,7 @@ class Window:
         model.vis.global_.fovy = camera.opening
         panels = {"show_left_ui": False, "show_right_ui": False}
         self._viewer = mujoco.viewer.launch_passive(model, data, **panels)
-        self._viewer.opt.sitegroup[:] = 0  # the closures' sites
+        self._viewer.opt.sitegroup[:] = 0  # hides the sites of the loop closures
         self._model, self._aimed = model, None
 
     def close(self) -> None:

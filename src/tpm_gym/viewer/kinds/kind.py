@@ -93,11 +93,12 @@ class Kind:
 
     Attributes:
         machine: The machine.
-        lists: Labels and explanations of lists in the panel: first operation mode, last assembly
-            mode; those between, at most two, choose the working mode.
-        working: Working modes by the words chosen in these lists.
+        lists: Labels of the lists in the panel, with an explanation each. The first list chooses
+            the operation mode, the last one the assembly mode. Lists between, at most two, choose
+            the working mode.
+        working: Working modes by the entries chosen in the lists between.
         assembly: Assembly modes by operation mode and label.
-        lows: Lower ends of the sliders of three motors, degrees. A slide has its stops.
+        lows: Lower ends of the sliders of three motors, degrees. For a slide, its stops count.
     """
 
     lists: Mapping[str, str] = {"Operation": "Operation mode", "Assembly": "Assembly mode"}
@@ -112,16 +113,16 @@ class Kind:
     def at_point(
         self, position: ArrayLike, operation: str, working: Any, tilt: float = 0.0
     ) -> Posture:
-        """Solve the posture with P at ``position`` (3,) m, on a working mode.
+        """Solve the posture with P at ``position`` (3,) m, in a working mode.
 
         Args:
             position: Point P, machine's frame.
             operation: Operation mode.
             working: Working mode.
-            tilt: Of several rotated postures, the one with the tilt nearest to this is taken, rad.
+            tilt: Preferred tilt, rad. Of several rotated postures, the nearest in tilt is returned.
 
         Raises:
-            InputError: If position is no three finite numbers, or no such rotated posture exists.
+            InputError: If position is not three finite numbers, or no rotated posture exists there.
             UnreachableError: If a leg does not reach.
         """
         del operation, working, tilt
@@ -129,10 +130,10 @@ class Kind:
         return self.at_joints(theta, None)
 
     def at_joints(self, theta: ArrayLike, assembly: Any) -> Posture:
-        """Solve the posture with the motors at ``theta`` (3,) rad, on an assembly mode.
+        """Solve the posture with the motors at ``theta`` (3,) rad, in an assembly mode.
 
         Raises:
-            InputError: If theta is no three finite numbers, or a rotated mode does not exist there.
+            InputError: If theta is not three finite numbers, or the rotated mode does not exist.
             UnreachableError: If the assembly mode does not exist there.
         """
         angles = vector("theta", theta)
@@ -153,7 +154,7 @@ class Kind:
         return self.at_joints(state.theta, getattr(self.machine, "assembly_mode", None))
 
     def layers(self, posture: Posture) -> Mapping[str, Found]:
-        """Return the layers that there are around a posture, by name.
+        """Return the available layers of a posture, by name.
 
         Names, and what each layer's function returns:
 
@@ -167,7 +168,7 @@ class Kind:
 
 
 def elbows(out: Sequence[float]) -> dict[str, tuple[Any, ...]]:
-    """Return the signs of three legs by the words for their elbows.
+    """Return the signs of three legs by labels such as ``"out / in / out"``.
 
     Args:
         out: For each leg, the sign with the elbow out.

@@ -148,7 +148,7 @@ class TPMKind(Kind):
             return working, lambda: {name: surface(name, working, g) for name in factors}
 
         def found_aspects() -> list[Cells]:
-            """Find those on the side of P; those beyond y = 0 are their mirror images."""
+            """Find the aspects on P's side of y = 0; the others are their mirror images."""
             return [a.cells for a in aspects(working, g) if a.assembly.sin_beta == side]
 
         def quality(points: FloatArray) -> FloatArray:
@@ -169,7 +169,7 @@ class TPMKind(Kind):
     def margin(self, posture: Posture) -> Margin | None:
         """Find the nearest singular position of P.
 
-        The search takes 5 to 10 ms, unlike the solution of a posture.
+        The search takes 5 to 10 ms, longer than solving a posture.
         """
         modes = posture.working, posture.assembly
         found = nearest_singularity(posture.position, *modes, self.machine.geometry)
@@ -179,7 +179,7 @@ class TPMKind(Kind):
 
 
 def _slot(found: kinematics.RotatedPostures, slot: int) -> kinematics.RotatedPostures:
-    """Return the posture in one slot."""
+    """Return the posture at index ``slot``."""
     theta, link3, tilt, beta = found.theta[slot], found.link3[slot], found.tilt[slot], found.beta
     return kinematics.RotatedPostures(theta, link3, tilt, beta[slot], found.geometry)
 

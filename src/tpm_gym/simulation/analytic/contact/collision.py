@@ -59,7 +59,7 @@ class _Box(NamedTuple):
 
 @compiled
 def _two(a: int, b: int) -> tuple[int, int]:
-    """Return a pair of integers. For literal constants, Numba would compile callers again."""
+    """Return a pair of integers; a literal constant would make Numba compile functions again."""
     return 1 * a, 1 * b
 
 
@@ -118,7 +118,7 @@ def collide_objects(
         objects: (k,) objects.
         held: Index of the held object; -1 for none.
         setting: Constants of the simulation.
-        polygons: (2, 12, 3) m, workspace.
+        polygons: (2, 12, 3) m, scratch memory.
         contacts: Output.
         count: Number of contacts at the call.
     """
@@ -145,7 +145,7 @@ def collide_objects(
 def _collide_table(
     box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
-    """Add the corners of an object near table or belt, or near the floor if it is beside both."""
+    """Add contacts of corners with table or belt; with the floor if the centre is over neither."""
     (x, y, z), (count, slot), (low, high, edge) = box.middle, place, setting.table
     over = low <= x <= high and abs(y) <= edge
     height = z - (TABLE.top if over else FLOOR.top)
@@ -242,7 +242,10 @@ def _nearest(box: _Box, lip: Vector) -> Vector:
 
 @compiled
 def _press_edge(box: _Box, lip: Vector, contacts: Records, place: _Place, pair: _Pair) -> int:
-    """Add the two ends of the part of a tilted object's uppermost edge that is below the lip."""
+    """Add contacts of the lip with the uppermost edge of a tilted object.
+
+    They are the two ends of the part of the edge that is below the lip.
+    """
     (u, v, w), (p, q, r), low = box.frame, box.half, 0
     for k in range(1, 3):
         if box.half[k] * abs(box.frame[k][2]) < box.half[low] * abs(box.frame[low][2]):
@@ -352,7 +355,10 @@ def _collide_boxes(
 
 @compiled
 def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
-    """Return the arms (m) to the nearest points of two edges along axes i and j."""
+    """Return the vectors (m) from both centres to the nearest points of two edges, and zero.
+
+    The edges are parallel to axis i of ``one`` and to axis j of ``two``.
+    """
     a, b, (p, q) = one.middle, two.middle, (one.frame[i], two.frame[j])
     for k in range(3):
         if k != i:
@@ -379,7 +385,7 @@ def _clip_face(
     place: _Place,
     pair: _Pair,
 ) -> int:
-    """Add the corners of the overlap of a box's face and the opposite face of another box.
+    """Add contacts at the corners of the overlap of a box's face and the face opposite to it.
 
     The normal of the face is axis ``face`` of ``plane``. ``sign`` is 1 if ``plane`` is body a of
     the pair, and -1 if it is body b.

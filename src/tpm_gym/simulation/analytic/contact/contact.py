@@ -105,12 +105,12 @@ class Contact:
             rows: (r,) indices of the tables.
             route: Motion of point P.
             vacuum_on: (r,) whether the vacuum is on.
-            last: Number of last time steps whose forces are returned, m.
+            last: Number m of time steps at the end whose forces are returned.
 
         Returns:
             Force (r, m, 3) N of cup and objects on the platform in each time step, machine's
-            frame, without weight and inertia of a cup that does not slide. Mass (r,) kg of the held
-            objects.
+            frame. It does not include weight and inertia of a cup that does not slide, because the
+            machine's dynamics include them. Mass (r,) kg of the held objects.
         """
         force, carried = np.zeros((len(rows), last, 3)), np.zeros(len(rows))
         if self._blocks:

@@ -16,7 +16,7 @@ from tpm_gym.simulation.vectors import cross, dot, plus, put, three
 
 _SWEEPS = 12
 _RELAXATION = 1.3  # over-relaxation of normal impulses; the sweeps converge below 2
-_STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: objects below both speeds do not move
+_STILL, _UNTURNED = 5e-4, 0.01  # m/s, rad/s: objects below both speeds count as still
 _TOLERANCE = 3e-4  # m/s; a sweep that changes velocities by less is the last sweep
 _RECOVERY = 0.1  # fraction of a penetration that a time step removes
 _SLOP = 1e-5  # m, penetration that is not removed
@@ -30,7 +30,7 @@ class Motor(NamedTuple):
 
     Attributes:
         speed: Target of the cup's vertical velocity, m/s.
-        mass: Mass of the cup and the held object, kg.
+        mass: Mass of body 0, kg: the cup with the held object.
         limit: Largest downward impulse, N s.
     """
 
@@ -151,7 +151,7 @@ def _apply(contact: Record, bodies: Records, impulse: Vector) -> None:
 
 @compiled
 def _relax(contact: Record, bodies: Records) -> bool:
-    """Update the impulse of one contact; return whether the change was larger than negligible."""
+    """Update the impulse of one contact; return False if the change is negligible."""
     speed = _speed(bodies[contact["b"]], three(contact["arm_b"]))
     if contact["a"] >= 0:
         own = _speed(bodies[contact["a"]], three(contact["arm_a"]))

@@ -22,7 +22,7 @@ OBJECT: Final = np.dtype(
         ("spin", "f8", 3),  # angular velocity; rad/s, world
         ("mass", "f8"),  # kg
         ("friction", "f8"),  # Coulomb coefficient
-        ("rest", "f8"),  # number of last time steps without motion; at rest from AT_REST on
+        ("rest", "f8"),  # number of time steps since the last motion; AT_REST or more: at rest
     ],
     align=True,
 )
@@ -88,7 +88,8 @@ class Setting(NamedTuple):
         table: Lowest and highest x of table and belt, and half their width, m.
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
-        turn, origin: Factors, and origin (m), that convert the machine's frame to the world frame.
+        turn: Factors (1 or -1) of the machine's axes in the world frame.
+        origin: Origin of the machine's frame in the world frame, m.
     """
 
     half: FloatArray
@@ -106,7 +107,7 @@ class Tables(NamedTuple):
         objects: (n, k) records of :data:`OBJECT`.
         cups: (n,) records of :data:`CUP_STATE`.
         forces: (n, slots(k), 3) N, contact forces of the last time step.
-        awake: (n,) whether objects or cup may change while the lip stays away.
+        awake: (n,) whether objects or cup may change although the lip is far from all objects.
         belts: (n,) m/s, speeds of the belts along x.
     """
 
@@ -121,8 +122,8 @@ class Route(NamedTuple):
     """Motion of point P in K time steps, for r robots; m, machine's frame, contiguous arrays.
 
     Attributes:
-        before: (r, 3), before the last time step.
-        now: (r, 3), at the beginning.
+        before: (r, 3), P one time step before the beginning.
+        now: (r, 3), P at the beginning.
         controls: (r, c, 3), control points, whose convex hull contains the motion.
         weights: (K, c), weights of the control points after each time step.
     """

@@ -31,14 +31,14 @@ from tpm_gym.simulation.vectors import axes, cross, dot, length, plus, put, put_
 
 _SLOW, _SLOW_SPIN = 5e-3, 0.3  # m/s, rad/s: objects below both speeds may come to rest
 _SETTLED, _STOPPED = 1e-6, 1e-3  # m, m/s: below both, the slide is set to 0
-_LEVEL = 1e-9  # m; an object at most so far above the table top stands on it
+_LEVEL = 1e-9  # m; largest distance from the table top of an object that stands on it
 _NEARBY = 5e-4  # m; margin for contacts of the lip, beyond its motion in a time step
-_BESIDE = 0.005  # m; margin around objects at rest within which the lip ends the skipping
+_BESIDE = 0.005  # m; a table is not skipped if the lip may come closer to an object
 _FREE_CUP = 4 * CUP_MASS
 """Inertia of an empty cup, kg.
 
-It is similar to an object's mass, because the solver then converges several times faster than with
-the true mass. The spring still accelerates the cup at 300 m/s^2.
+It is larger than the true mass and similar to an object's mass: then the solver converges several
+times faster. The spring can accelerate this mass at 300 m/s^2.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
@@ -61,7 +61,7 @@ def advance(
 
     Args:
         tables: State of all tables; changed.
-        earlier: Output; state at the beginning of the tables that are simulated.
+        earlier: Output: state of the simulated tables at the beginning of the control period.
         push: (r, m, 3) N, force on the platform in the last m time steps, machine's frame; output,
             initially zero.
         carried: (r,) kg, masses of the held objects at the end; output, initially zero.
@@ -201,7 +201,7 @@ def _slow(objects: Records) -> bool:
 
 
 def _reached(objects: Records, row: int, path: Route, i: int, setting: Setting) -> bool:
-    """Return whether the lip may touch an object, from boxes around path and objects."""
+    """Return whether the lip may touch an object: compare boxes around the path and the objects."""
     turn, origin, reached = setting.turn[2], setting.origin[2], False
     for index in range(objects.shape[1]):
         near = length(row_of(setting.half, index)) + _BESIDE
@@ -209,7 +209,7 @@ def _reached(objects: Records, row: int, path: Route, i: int, setting: Setting) 
         low = turn * path.now[i, 2] + origin < level
         for j in range(path.controls.shape[1]):
             low |= turn * path.controls[i, j, 2] + origin < level
-        # Seldom true, and so small that the compiler needs no call.
+        # ``low`` is seldom true. With _beside() apart, this function is small enough to be inlined.
         reached = reached or (low and _beside(objects[row, index], near, path, i, setting))
     return reached
 
@@ -229,7 +229,7 @@ def _beside(item: Record, size: float, path: Route, i: int, setting: Setting) ->
 
 @compiled
 def _range(path: Route, i: int, axis: int, setting: Setting) -> tuple[float, float]:
-    """Return lowest and highest coordinate (m, world) of point P at and after the beginning."""
+    """Return lowest and highest coordinate (m, world) of point P and its control points."""
     turn, origin = setting.turn[axis], setting.origin[axis]
     low = high = turn * path.now[i, axis] + origin
     for j in range(path.controls.shape[1]):
@@ -281,7 +281,7 @@ def _step(
 def _fill(
     objects: Records, cup: Record, way: Way, mass: float, setting: Setting, bodies: Records
 ) -> None:
-    """Set the solver's bodies to their masses, and to their velocities without contacts."""
+    """Set the masses of the solver's bodies, and the velocities that they have without contacts."""
     step, body = setting.step, bodies[0]
     x, y, _ = plus(way.then, way.now, -1.0)
     z = (way.now[2] - way.before[2]) / step + cup["slide_rate"]
