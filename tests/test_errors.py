@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tpm_gym import errors
+from tpm_gym import TPMEnv, errors
 from tpm_gym.errors import (
     ActionError,
     ClosureError,
@@ -99,6 +99,12 @@ def test_errors_carry_their_values_show_them_and_survive_the_way_between_process
     for again in (copy.copy(error), copy.deepcopy(error), pickle.loads(pickle.dumps(error))):
         assert type(again) is kind
         assert (str(again), vars(again)) == (str(error), vars(error))
+
+
+def test_values_that_have_no_text_do_not_spoil_the_message():
+    with pytest.raises(ConfigurationError, match=r"width = .*int.* is not possible") as caught:
+        TPMEnv(width=10**5000)
+    assert caught.value.value == 10**5000
 
 
 def test_every_error_is_a_case_above():

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.errors import InputError, TPMError
+from tpm_gym.errors import brief as brief
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -23,7 +24,6 @@ Quaternion = tuple[float, float, float, float]
 """Quaternion (x, y, z, w)."""
 
 _Error = Callable[[str, Any, str], TPMError]
-_LONGEST = 200  # characters of a value in a message
 
 
 def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArray:
@@ -145,12 +145,3 @@ def _holds_masked(value: Any) -> bool:
     """Return whether a value is a masked array, or a sequence that holds one."""
     items = {type(item) for item in value} if isinstance(value, (list, tuple)) else {type(value)}
     return any(issubclass(kind, np.ma.MaskedArray) for kind in items)
-
-
-def brief(value: Any) -> Any:
-    """Return a value for a message, or the beginning of a long one."""
-    try:
-        text = repr(value)
-    except Exception as error:  # integers beyond 4300 digits, and any other repr() that fails
-        return f"{type(value).__name__} ({error})"
-    return value if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."

@@ -8,6 +8,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+_LONGEST = 200  # characters of a value in a message
+
+
+def brief(value: Any) -> Any:
+    """Return a value for a message, or the beginning of a long one."""
+    try:
+        text = repr(value)
+    except Exception as error:  # integers beyond 4300 digits, and any other repr() that fails
+        return f"{type(value).__name__} ({error})"
+    return value if len(text) <= _LONGEST else f"{text[:_LONGEST]}..."
+
 
 class TPMError(Exception):
     """Root of all errors raised by tpm_gym. They survive pickling, as between worker processes.
@@ -19,7 +30,12 @@ class TPMError(Exception):
 
     def __str__(self) -> str:
         """Return the message."""
-        return self.template.format(**vars(self)) if self.template else super().__str__()
+        if not self.template:
+            return super().__str__()
+        try:
+            return self.template.format(**vars(self))
+        except Exception:  # a value without a repr()
+            return self.template.format(**{name: brief(v) for name, v in vars(self).items()})
 
 
 @dataclass(eq=False)

@@ -1,5 +1,6 @@
 """Reachable sets, aspects and boxes agree with brute force on the factors of the oracle."""
 
+import math
 from dataclasses import replace
 from itertools import product
 
@@ -46,6 +47,26 @@ def test_the_grid_covers_the_reachable_set(g, seed, mode):
     high = np.asarray(cells.low) + np.asarray(cells.spacing) * cells.mask.shape
     assert ((points >= cells.low) & (points <= high + 1e-12)).all()
     np.testing.assert_array_equal(cells.mask, cells.mask[:, ::-1])
+
+
+def test_the_grid_is_no_wider_than_the_legs_reach():
+    first, last = set(), set()
+    for l2, l3, l5, l7 in product((0.07, 0.6), (0.1, 0.35), (0.01, 0.4), (0.05, 0.9)):
+        g = replace(PAPER, l2=l2, l3=l3, l5=l5, l7=l7)
+        ends: tuple[list[float], list[float]] = [], []
+        for sign, side in zip((-1, 1), ends, strict=True):
+            far = sign * (g.l3 + g.l4)  # legs 2 and 3 are stretched, and rod 4 is level
+            beta = math.pi if sign < 0 else 0.0
+            for x_c in (sign * g.l4, 2 * g.l5 - g.l1 + far):
+                side.append(oracle.points(np.zeros(3), x_c, 0.0, beta, g)["P"][0])
+            side.append(g.l1 + far - g.l2)
+        low, high = max(ends[0]), min(ends[1])
+        cells = aspects.reachable_set(geometry=g, shape=(16, 4, 16))
+        first.add(ends[0].index(low))
+        last.add(ends[1].index(high))
+        assert cells.low[0] == pytest.approx(low)
+        assert cells.low[0] + 16 * cells.spacing[0] == pytest.approx(high)
+    assert first == last == {0, 1, 2}  # each leg is the nearest limit somewhere
 
 
 @pytest.mark.parametrize("mode", [ELBOWS_OUT, WORKING_MODES[0]])
@@ -105,6 +126,8 @@ def test_volume_error_counts_no_flat_faces():
     assert cells.volume == 32
     assert cells.volume_error == 0.5 * 2 * 16  # 16 cells outside touch the rim, a layer
     assert len(cells.centres()) == 32
+    whole = Cells((0, 0, 0), (1, 1, 1), np.ones((4, 4, 6), dtype=bool))
+    assert whole.volume_error == 0.5 * 4 * 2 * (4 + 6)  # all cells beyond the grid are outside
     assert cells.centres()[0].tolist() == [1.5, 2.5, 1.5]
 
 
@@ -228,7 +251,9 @@ def test_samples_depend_on_the_rng_alone_and_are_not_singular():
 
 
 @pytest.mark.parametrize(
-    "shape", [(8, 8), (8, 7, 8), (1, 8, 8), (8, 8, 0), (8.5, 8, 8), (8, -2, 8), (8, 8, 8, 8)]
+    "shape",
+    [(8, 8), (8, 7, 8), (1, 8, 8), (8, 8, 0), (8.5, 8, 8), (8, -2, 8), (8, 8, 8, 8)]
+    + [8, "888", None, (float("inf"), 8, 8)],
 )
 def test_grids_that_are_none_are_refused(shape):
     for function in (aspects.reachable_set, aspects.aspects):
@@ -240,18 +265,20 @@ def test_grids_that_are_none_are_refused(shape):
 
 def test_bad_arguments_are_refused():
     aspect = aspects.aspects(shape=COARSE)[0]
-    for threshold in (-0.1, 1.1, float("nan"), 0.9):  # no box is as good as the last
+    for threshold in (-0.1, 1.1, float("nan"), "0.1", 0.9):  # no box is as good as the last
         with pytest.raises(ConfigurationError) as caught:
             aspects.largest_box(aspect, threshold)
         assert caught.value.name == "threshold"
     rng = np.random.default_rng(4)
-    with pytest.raises(ConfigurationError, match="count"):
-        aspects.sample(rng, aspect, -1)
+    for count in (-1, 2.5, float("nan")):
+        with pytest.raises(ConfigurationError, match="count"):
+            aspects.sample(rng, aspect, count)
     empty = replace(aspect, cells=replace(aspect.cells, mask=np.zeros(COARSE, dtype=bool)))
     with pytest.raises(ConfigurationError, match="aspect"):
         aspects.sample(rng, empty, 1)
-    with pytest.raises(ConfigurationError, match="min_cells"):
-        aspects.aspects(min_cells=0)
+    for few in (0, float("nan")):
+        with pytest.raises(ConfigurationError, match="min_cells"):
+            aspects.aspects(shape=COARSE, min_cells=few)
 
 
 def test_mechanisms_that_reach_nothing_have_no_aspects():
@@ -259,6 +286,7 @@ def test_mechanisms_that_reach_nothing_have_no_aspects():
     cells = aspects.reachable_set(geometry=g, shape=COARSE)
     assert aspects.aspects(geometry=g, shape=COARSE) == ()
     assert cells.volume == cells.volume_error == 0
+    assert min(cells.spacing) > 0
 
 
 def largest(g: Geometry, shape: tuple[int, int, int]) -> aspects.Box:

@@ -122,6 +122,9 @@ def test_what_has_no_answer_raises():
     for region, error in ((beyond, UnreachableError), (across, ConfigurationError)):
         with pytest.raises(error):
             over(region)
+    for shape in ((0, 9, 9), (9, 9), (9, 9, 2.5)):
+        with pytest.raises(ConfigurationError, match="shape"):
+            over(PAPER_TPM.region, shape=shape)
     with pytest.raises(SingularityError):
         over(Region((0, 0, 0.8), (0, 0, 0.8)))
     with pytest.raises(UnreachableError):

@@ -8,7 +8,7 @@ import pytest
 from examples import examples
 from hypothesis import strategies as st
 
-from tpm_gym.analysis import singularity
+from tpm_gym.analysis import sheets, singularity
 from tpm_gym.analysis.singularity import FACTORS, SingularityType, nearest_singularity
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
@@ -267,7 +267,7 @@ def test_points_that_are_none_are_masked_in_batches():
 def test_bad_input_is_refused():
     theta = inverse(HOME)
     for function in (singularity.classify_at, singularity.classify, nearest_singularity):
-        for wrong in ([0.0, 0.0], 1.0):
+        for wrong in ([0.0, 0.0], 1.0, "abc", ["1", "2", "3"], [[1.0], [2.0, 3.0]], [10**400] * 3):
             with pytest.raises(InputError):
                 function(wrong)
     with pytest.raises(InputError):
@@ -278,7 +278,33 @@ def test_bad_input_is_refused():
     ):
         with pytest.raises(UnreachableError):
             function([good, unreachable])
-        for tolerance in (0.0, -1e-6, 1.0, float("nan")):
+        for tolerance in (0.0, -1e-6, 1.0, float("nan"), "0.1"):
             with pytest.raises(ConfigurationError) as caught:
                 function(good, tolerance=tolerance)
             assert caught.value.name == "tolerance"
+
+
+def test_a_surface_is_found_where_its_working_mode_ends_beside_it():
+    g = Geometry(l1=0.2655, l2=0.7646, l3=1.1043, l4=1.4283, l5=0.0666, l6=0.17, l7=0.0423)
+    point, mode = np.array([0.12752, 0.02962, 0.15762]), WorkingMode(1, 1, 1, -1)
+    found = nearest_singularity(point, mode, AssemblyMode(1, 1), g)
+    assert FACTORS[found.factor] == "planar"
+    inside = found.distance * np.random.default_rng(0).normal(size=(20_000, 3)) / 2
+    inside *= np.minimum(1.0, 0.999 * found.distance / np.linalg.norm(inside, axis=1))[:, None]
+    assert (singularity.factors_at(point + inside, mode, g).planar > 0).all()
+
+
+def test_without_a_surface_of_level3_there_are_the_others():
+    g = Geometry(l1=0.3, l2=0.07, l3=0.9, l4=0.7, l5=0.1, l6=0.01, l7=0.75)  # rod 11 < link 7
+    points = oracle.reachable_points(np.random.default_rng(0), 2000, g)
+    found = nearest_singularity(points, ELBOWS_OUT, SIDES[0], g)
+    assert found.valid.any()
+    assert (found.factor[found.valid] != FACTORS.index("level3")).all()
+
+
+def test_curves_serve_all_callers_and_cannot_be_changed():
+    x, *_ = sheets.curves("leg1", ELBOWS_OUT, PAPER)
+    with pytest.raises(ValueError, match="read-only"):
+        x += 1.0
+    with pytest.raises(InputError, match="level3, planar, leg1"):
+        sheets.curves("leg3", ELBOWS_OUT, PAPER)

@@ -286,5 +286,6 @@ def test_unreachable_and_malformed_angles_raise():
     for function in (describe, mobility):
         with pytest.raises(UnreachableError):
             function([0.0, 0.0, np.pi])
-        with pytest.raises(InputError):
-            function([0.0, np.nan, 0.0])
+        for wrong in ([0.0, np.nan, 0.0], [inverse([-0.04, 0.028, 0.8])], np.empty((0, 3))):
+            with pytest.raises(InputError):
+                function(wrong)

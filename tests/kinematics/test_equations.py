@@ -26,6 +26,8 @@ from tpm_gym.kinematics import (
 )
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry, Lengths
 from tpm_gym.kinematics.namespaces import NUMPY
+from tpm_gym.mechanism.delta import kinematics as delta
+from tpm_gym.mechanism.delta.geometry import IRB_360, DeltaLengths
 
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
 LOW, HIGH = (-0.24, 0.012, 0.66), (0.12, 0.046, 0.90)
@@ -171,6 +173,31 @@ def test_branches_that_do_not_exist_leave_the_derivatives_of_the_others_finite()
         sum(value[found.valid].sum() for value in values).backward()
         assert torch.isfinite(tensor.grad).all()
         assert (tensor.grad != 0).any(dim=-1).equal(found.valid.any(dim=-1))
+
+
+@pytest.mark.parametrize(
+    ("function", "kind", "g", "inputs"),
+    [
+        (workspace.conditioning_at, Lengths, PAPER, places(5, 3000, PAPER)),
+        (workspace.conditioning_at, Lengths, PAPER, [[-0.04, 0.0, 0.8], [-0.04, 0.03, 0.8]]),
+        (delta.conditioning_at, DeltaLengths, IRB_360, places(5, 3000, WIDE)),
+        (delta.jacobian, DeltaLengths, IRB_360, angles(6, 3000)),
+    ],
+    ids=["reach", "y = 0", "Delta", "Jacobian"],
+)
+def test_rows_without_a_value_leave_the_derivatives_by_the_lengths_finite(
+    function, kind, g, inputs
+):
+    derivatives, there = [], torch.ones(len(inputs), dtype=torch.bool)
+    for _ in range(2):  # all rows, then those with a value
+        lengths = torch.tensor([*vars(g).values()], requires_grad=True, dtype=torch.float64)
+        given = torch.as_tensor(inputs, dtype=torch.float64)[there]
+        found = function(given, geometry=kind(*lengths)).nan_to_num(0.0)
+        found.sum().backward()
+        derivatives.append(lengths.grad)
+        there = (found != 0).reshape(len(found), -1).any(-1)
+    assert 0 < sum(there) < len(inputs)
+    torch.testing.assert_close(*derivatives)
 
 
 # -- singularities ---------------------------------------------------------------------------------

@@ -8,7 +8,9 @@ import oracle
 import pytest
 
 from tpm_gym import kinematics
+from tpm_gym.analysis import singularity
 from tpm_gym.errors import InputError, UnreachableError
+from tpm_gym.kinematics import forward, inverse, jacobian, workspace
 from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.kinematics.modes import (
     ASSEMBLY_MODES,
@@ -39,6 +41,28 @@ def test_anything_but_signs_is_refused(bad):
             with pytest.raises(InputError) as caught:
                 kind(*signs)
             assert caught.value.name == kind.__name__
+
+
+@pytest.mark.parametrize("branch", [DEFAULT_ASSEMBLY, (1, 1, -1, 1), "elbows out", None])
+@pytest.mark.parametrize(
+    "function",
+    [inverse, jacobian.factors_at, jacobian.conditioning_at, workspace.reachable]
+    + [workspace.assembly_of, singularity.classify_at],
+)
+def test_anything_but_a_working_mode_is_refused(function, branch):
+    with pytest.raises(InputError, match="WorkingMode"):
+        function(CENTRE, branch)
+
+
+@pytest.mark.parametrize("branch", [ELBOWS_OUT, (-1, 1), None])
+def test_anything_but_an_assembly_mode_is_refused(branch):
+    theta = inverse(CENTRE)
+    for function in (forward, jacobian.velocity, jacobian.factors, singularity.classify):
+        with pytest.raises(InputError, match="AssemblyMode"):
+            function(theta, branch)
+    for function in (jacobian.conditioning_at, singularity.nearest_singularity):
+        with pytest.raises(InputError, match="AssemblyMode"):
+            function(CENTRE, ELBOWS_OUT, branch)
 
 
 @pytest.mark.filterwarnings("error")

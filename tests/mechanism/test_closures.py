@@ -9,7 +9,7 @@ from gantry import GANTRY
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import PAPER_TPM, TPM
-from tpm_gym.mechanism.bodies import Closure, Joint, Link, Mechanism
+from tpm_gym.mechanism.bodies import STEEL, Closure, Joint, Link, Mechanism, Solid
 from tpm_gym.mechanism.closures import require_sound
 
 SOUND = PAPER_TPM.mechanism
@@ -34,6 +34,12 @@ def with_joint(link: str, **changes: object) -> Mechanism:
 def with_closure(**changes: object) -> Mechanism:
     first, *rest = SOUND.closures
     return replace(SOUND, closures=(replace(first, **changes), *rest))
+
+
+def with_solid(**changes: object) -> Mechanism:
+    base, *others = SOUND.links
+    box = replace(Solid("box", (0.1, 0.1, 0.1), (0.0, 0.0, 0.0), STEEL), **changes)
+    return replace(SOUND, links=(replace(base, solids=(*base.solids, box)), *others))
 
 
 BROKEN: dict[str, tuple[Callable[[], Mechanism], str]] = {
@@ -65,6 +71,12 @@ BROKEN: dict[str, tuple[Callable[[], Mechanism], str]] = {
         lambda: replace(SOUND, links=(Link("base", ()), *SOUND.links[1:])),
         "links with a mass",
     ),
+    "a long axis": (lambda: with_joint("rod_6", axis=(0.0, 2.0, 0.0)), "axis of length 1"),
+    "a fixed joint": (lambda: with_joint("rod_6", kind="fixed"), "continuous, revolute"),
+    "a sphere": (lambda: with_solid(kind="sphere"), "boxes and cylinders"),
+    "a box without a length": (lambda: with_solid(size=(0.1, -0.1, -0.1)), "positive size"),
+    "a bore through all": (lambda: with_solid(bore=(0.2, 0.2, 0.2)), "smaller bore"),
+    "a solid along xy": (lambda: with_solid(axis="xy"), "along x, y or z"),
     "a second base": (
         lambda: replace(SOUND, links=(*SOUND.links, Link("other", ()))),
         "first alone has no joint",

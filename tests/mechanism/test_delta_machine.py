@@ -14,7 +14,15 @@ from mutated import functions_of, install
 from roots import circle_roots, unit, unmatched
 from walk import gaps, place, walk
 
-from tpm_gym.errors import ConfigurationError, GeometryError, SingularityError, UnreachableError
+from tpm_gym.analysis.delta import aspects, chains, reachable_set
+from tpm_gym.errors import (
+    ConfigurationError,
+    GeometryError,
+    InputError,
+    SingularityError,
+    UnreachableError,
+)
+from tpm_gym.kinematics.geometry import PAPER
 from tpm_gym.mechanism import DELTA
 from tpm_gym.mechanism.closures import closure_jacobian, moving_joints
 from tpm_gym.mechanism.delta import kinematics
@@ -278,11 +286,38 @@ def test_lengths_that_make_no_delta_are_refused(name, value):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("geometry", None), ("working_mode", (1, 0, 1)), ("assembly_mode", 0), ("home", (0, 0, 3))],
+    [("geometry", None), ("working_mode", (1, 0, 1)), ("assembly_mode", 0), ("home", (0, 0, 3))]
+    + [("assembly_mode", np.ones(2)), ("working_mode", "out")],
 )
 def test_machines_on_which_no_episode_could_run_are_refused(name, value):
     with pytest.raises((ConfigurationError, UnreachableError), match=name):
         replace(DELTA, **{name: value})
+
+
+def test_anything_but_modes_and_lengths_of_a_delta_is_refused():
+    home, theta = DELTA.home, DELTA.inverse(DELTA.home)
+    at_points = kinematics.factors_at, kinematics.conditioning_at, kinematics.reachable
+    for function in at_points:
+        for bends in ((1, 1, 2), (1, 1), "out"):
+            with pytest.raises(InputError, match="bends"):
+                function(home, bends)
+    for function in (kinematics.jacobian, kinematics.factors, chains):
+        for side in (0.5, None, np.ones(2)):
+            with pytest.raises(InputError, match="side"):
+                function(theta, side)
+    for function in (kinematics.conditioning_at, kinematics.inverse_all, kinematics.forward_all):
+        with pytest.raises(InputError, match="geometry"):
+            function(home, geometry=PAPER)
+    for function in (aspects, reachable_set):
+        with pytest.raises(InputError, match="geometry"):
+            function(geometry=PAPER)
+        with pytest.raises(InputError, match="bends"):
+            function((1, 1, 2), shape=(8, 8, 8))
+    for shape in (8, (8, 8), (8, 1, 8)):
+        with pytest.raises(ConfigurationError, match="shape"):
+            aspects(shape=shape)
+    with pytest.raises(ConfigurationError, match="min_cells"):
+        aspects(shape=(8, 8, 8), min_cells=0)
 
 
 # Bodies

@@ -21,6 +21,8 @@ from tpm_gym.kinematics import ASSEMBLY_MODES, AssemblyMode, forward_all, invers
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
 from tpm_gym.mechanism import PAPER_TPM, TPM, Machine, virtual_work
 from tpm_gym.mechanism.bodies import Mechanism, Solid
+from tpm_gym.mechanism.delta.dynamics import DeltaDynamics
+from tpm_gym.mechanism.delta.geometry import IRB_360
 from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.tpm.bodies import build, joint_angles
 from tpm_gym.mechanism.tpm.dynamics import Dynamics
@@ -156,6 +158,15 @@ def test_links_and_factors_that_are_not_the_mechanisms_are_refused():
         for value in values:
             with pytest.raises(ConfigurationError, match=name):
                 Dynamics(**{name: value})
+    same = Dynamics(link_masses=np.ones(LINKS)), Dynamics()
+    np.testing.assert_array_equal(*(one.gravity(HOME) for one in same))
+    for kind, other, modes in (
+        (Dynamics, IRB_360, {"branch": 1}),
+        (DeltaDynamics, PAPER, {"side": 0.5}),
+    ):
+        for wrong in ({"geometry": other}, {"geometry": None}, modes):
+            with pytest.raises(InputError, match=next(iter(wrong))):
+                kind(**wrong)
 
 
 def test_states_that_do_not_go_together_are_named():

@@ -17,7 +17,7 @@ from tpm_gym.errors import (
     TPMError,
     UnreachableError,
 )
-from tpm_gym.kinematics import inverse
+from tpm_gym.kinematics import DEFAULT_ASSEMBLY, inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.mechanism import (
     PAPER_TPM,
@@ -144,6 +144,8 @@ LOW, HIGH = PAPER_TPM.region.low, PAPER_TPM.region.high
         *((name, 3, "a Region") for name in ("region", "goal_region")),
         ("mount", 0.97, "a Mount"),
         ("geometry", 3, "a tpm_gym.Geometry"),
+        ("working_mode", DEFAULT_ASSEMBLY, "a tpm_gym.kinematics.WorkingMode"),
+        ("assembly_mode", (-1, 1), "a tpm_gym.kinematics.AssemblyMode"),
         ("safe_conditioning", 1.5, "1"),
         ("region", Region((LOW[0], -0.02, LOW[2]), HIGH), "beyond a singularity"),
         ("mount", Mount(height=0.9229), "0.923 m or more"),

@@ -10,10 +10,10 @@ import pytest
 from machines import anywhere, each_machine
 
 from tpm_gym.arrays import FloatArray
-from tpm_gym.errors import InputError
+from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.kinematics import ASSEMBLY_MODES, WORKING_MODES, forward_all, inverse_all, jacobian
 from tpm_gym.kinematics.geometry import PAPER, WIDE, Geometry
-from tpm_gym.mechanism import PAPER_TPM, TPM
+from tpm_gym.mechanism import DELTA, PAPER_TPM, TPM
 from tpm_gym.mechanism.tpm.rows import LOOPS
 
 GEOMETRIES = [PAPER, WIDE, Geometry(l1=0.31, l2=0.06, l3=0.36, l4=0.79, l5=0.11, l6=0.02, l7=0.07)]
@@ -160,8 +160,30 @@ def test_shapes_that_do_not_go_together_are_refused():
     for wrong in (np.zeros(2), np.zeros((3, 2)), 0.0):
         with pytest.raises(InputError, match="3"):
             PAPER_TPM.inverse(wrong)
-    with pytest.raises(ValueError, match="shape"):
+    with pytest.raises(InputError, match="shape"):
         PAPER_TPM.motion(np.zeros((2, 3)), np.zeros((3, 3)))
+    with pytest.raises(ConfigurationError, match="7 lengths"):
+        PAPER_TPM.built((0.3, 0.07))
+
+
+@pytest.mark.parametrize("machine", [PAPER_TPM, DELTA])
+def test_anything_but_numbers_is_refused(machine):
+    region, home = machine.region, machine.home
+    for wrong in (
+        "abc",
+        ["1", "2", "3"],
+        [10**400] * 3,
+        [1j, 0, 0],
+        np.array(["2020"] * 3, "M8[Y]"),
+    ):
+        for function in (
+            *(machine.inverse, machine.evaluate, machine.forward, machine.same_side, machine.reach),
+            *(machine.conditioning_at, machine.require_within_stops, machine.occupied),
+            *(machine.joint_positions, region.contains, region.project),
+            lambda values: machine.torque(home, home, values),
+        ):
+            with pytest.raises(InputError):
+                function(wrong)
 
 
 def test_all_kinds_of_arrays_share_one_compiled_loop():

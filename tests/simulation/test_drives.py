@@ -69,6 +69,8 @@ def hold(simulation: Alone, theta: FloatArray, torque: Vector = REST, periods: i
         ({"stiffness": 0.0}, "stiffness"),
         ({"stiffness": "high"}, "stiffness"),
         ({"stiffness": 10**400}, "stiffness"),
+        ({"stiffness": 1e300}, "stiffness"),  # its law overflows
+        ({"damping": 1e13}, "damping"),
         ({"damping": -1.0}, "damping"),
         ({"damping": float("nan")}, "damping"),
         ({"feedforward": "full"}, "feedforward"),

@@ -4,6 +4,8 @@ import inspect
 import itertools
 import re
 from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
 from typing import Any
 from unittest.mock import patch
 
@@ -77,6 +79,14 @@ def test_what_is_out_of_range_is_refused_by_name_value_and_limit():
         assert repr(caught.value.value) == repr(value)
         assert limit in caught.value.valid
         assert limit in str(caught.value)
+
+
+def test_length_errors_that_could_make_a_length_negative_are_refused():
+    short = replace(PAPER_TPM, name="short", geometry=replace(PAPER, l6=0.0005))
+    with closing(TPMEnv(machine=short, randomisation={"length_error": 0.0005}, engine="analytic")):
+        pass
+    with pytest.raises(ConfigurationError, match=r"shortest length of 'short', 0\.0005 m"):
+        TPMEnv(machine=short, randomisation={"length_error": 0.0006}, engine="analytic")
 
 
 def test_the_documentation_states_the_ranges():

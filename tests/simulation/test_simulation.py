@@ -11,8 +11,9 @@ from states import apart
 from tpm_gym.errors import ConfigurationError, InputError, UnreachableError
 from tpm_gym.kinematics import ELBOWS_OUT, inverse, jacobian
 from tpm_gym.mechanism import PAPER_TPM
-from tpm_gym.simulation import Block, Scene, Servo
+from tpm_gym.simulation import Block, Plant, Scene, Servo
 from tpm_gym.simulation.engine import spline_weights
+from tpm_gym.simulation.state import Patch
 
 HOME = np.array(PAPER_TPM.home)
 THETA = PAPER_TPM.inverse(PAPER_TPM.home)
@@ -20,6 +21,9 @@ THETA = PAPER_TPM.inverse(PAPER_TPM.home)
 
 def follow(simulation, commands):
     return [simulation.move(command) for command in commands]
+
+
+PATCH = Patch((0.0, 0.0), (0.1, 0.1), (1.0, 0.0, 0.0, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -30,6 +34,8 @@ def follow(simulation, commands):
             for name in ("width", "height", "mass", "friction")
             for value in (-0.05, 0.0, np.nan, np.inf, "heavy", None, [0.05])
         ),
+        *(("mass", value) for value in (1e-300, 1e300)),  # not with every engine
+        ("friction", 1e300),
         *(("name", value) for value in ("", 3, None)),
         *(("colour", value) for value in ("red", (1, 0, 0), (0, 0, 0, 1.1), (-0.1, 0, 0, 1))),
     ],
@@ -46,12 +52,28 @@ def test_blocks_that_cannot_be_are_refused(name, value):
         *(("objects", value) for value in ((Block(), Block()), (Block("goal"),), ("block",), None)),
         *(("markers", value) for value in (-1, 1.5, "one")),
         *(("marker_radius", value) for value in (0.0, np.nan, True)),
+        *(("belt", value) for value in (0.1, (0.0, 1.0))),
+        *(("patches", value) for value in (None, PATCH, [PATCH], ("red",))),
     ],
     ids=lambda value: str(value)[:20],
 )
 def test_scenes_that_cannot_be_are_refused(name, value):
     with pytest.raises(ConfigurationError) as caught:
         Scene(**{name: value})
+    assert caught.value.name == name
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, value) for name in ("low", "high") for value in ("x", (0.0,), (0.0, np.nan))),
+        *(("high", value) for value in ((0.0, 1.0), (-1.0, 1.0))),
+        *(("colour", value) for value in ("red", (1, 0, 0), (0, 0, 0, 1.1))),
+    ],
+)
+def test_patches_that_cannot_be_are_refused(name, value):
+    with pytest.raises(ConfigurationError) as caught:
+        replace(PATCH, **{name: value})
     assert caught.value.name == name
 
 
@@ -118,6 +140,8 @@ def test_what_cannot_be_followed_raises_and_moves_nothing(simulation):
     ):
         with pytest.raises(error):
             call(value)
+    with pytest.raises(InputError, match=r"\['cube'\]"):  # the scene has an 'object'
+        simulation.reset(THETA, {"cube": (0.0, -0.02, 0.015)}, Plant(friction=0.5))
     after = simulation.read()
     assert np.array_equal(before.theta, after.theta)
     assert np.array_equal(before.command, after.command)

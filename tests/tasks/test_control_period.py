@@ -8,6 +8,7 @@ import pytest
 from tpm_gym import PAPER_TPM, TPMEnv, TPMVectorEnv
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.tasks import Expert, Reach
+from tpm_gym.tasks.push import Push
 
 ENGINES = ("pybullet", "mujoco", "analytic")
 
@@ -48,6 +49,22 @@ def test_the_expert_takes_as_long(engine, drive):
                 steps += 1
             reached[task] = steps * task.control_period
     assert reached[Quick] == pytest.approx(reached[Reach], abs=0.05)
+
+
+class QuickPush(Push):
+    """Push with four times as many commands."""
+
+    control_period = 0.010
+
+
+def test_the_expert_pushes_at_the_same_pace():
+    with closing(TPMEnv(QuickPush, engine="analytic")) as env:
+        for seed in range(4):
+            observation, _ = env.reset(seed=seed)
+            expert = Expert(env)
+            for _ in range(4 * Push.max_episode_steps):
+                observation, *_, info = env.step(expert.act(observation))
+            assert info["is_success"]
 
 
 def test_time_steps_are_a_tenth_of_it_or_as_asked():

@@ -35,6 +35,9 @@ def test_the_expert_picks_at_any_speed_of_the_belt(speed):
     *_, (_, _, info) = expert_episode(env, 0, STEPS, options)
     assert env.unwrapped.state.belt_speed == speed
     assert info["is_success"]
+    # A block on a belt that stands is drawn at the edge of the reach.
+    *_, (_, _, info) = expert_episode(env, 0, STEPS, {"belt_speed": speed})
+    assert info["is_success"]
 
 
 def test_tempting_ways_are_only_just_safe():
@@ -53,7 +56,7 @@ def test_the_camera_shows_the_block_as_many_steps_late_as_stated():
     rng, delay = np.random.default_rng(0), Conveyor.camera_delay
     for seed in range(2):  # the second episode shows nothing of the first
         observation, _ = env.reset(seed=seed)
-        true, shown = [env.state.object_position[0]], []
+        true, shown = [env.state.object_position[0].copy()], []
         for step in range(12):
             seen = env.task.decode(observation["observation"])["object_position"]
             np.testing.assert_allclose(seen, observation["achieved_goal"], atol=1e-6)
@@ -63,7 +66,8 @@ def test_the_camera_shows_the_block_as_many_steps_late_as_stated():
                 env.step(env.action_space.sample())
                 observation = env.restore_state(snapshot)
             observation = env.step(rng.uniform(-1, 1, 4))[0]
-            true.append(env.state.object_position[0])
+            true.append(env.state.object_position[0].copy())
+            env.state.object_position[:] = 5.0  # changes nothing that the camera shows
         expected = [true[max(0, k - delay)] for k in range(len(shown))]
         np.testing.assert_allclose(shown, expected, atol=1e-6)
         assert true[-1][0] - true[0][0] > 0.01
@@ -72,7 +76,7 @@ def test_the_camera_shows_the_block_as_many_steps_late_as_stated():
 def test_impossible_options_of_the_belt_are_refused():
     task = Conveyor(PAPER_TPM)
     rngs = [np.random.default_rng(0)]
-    for speed in (1.5, np.nan, [0.1, 0.1], "fast"):
+    for speed in (1.5, np.nan, [0.1, 0.1], "fast", [[0.1], [0.1, 0.2]]):
         with pytest.raises(ResetOptionError, match="belt_speed"):
             task.start(rngs, {"belt_speed": speed})
     with pytest.raises(UnreachableError):  # the place is in the tray

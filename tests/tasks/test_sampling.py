@@ -15,8 +15,10 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks import PickAndPlace, Reach, Task
+from tpm_gym.tasks.conveyor import Conveyor
 from tpm_gym.tasks.push import Push
 from tpm_gym.tasks.sampling import APART, BAND, line_in_joints, safe_points
+from tpm_gym.tasks.stack import Stack
 
 SAFE = PAPER_TPM.safe_conditioning
 BLOCK = PickAndPlace.block
@@ -144,6 +146,11 @@ def test_nearly_half_of_what_reaches_a_tempting_goal_is_unsafe(kind):
     assert share.max() < 0.6
 
 
+def test_every_episode_starts_where_one_draw_of_some_300_fits():
+    narrow = replace(PAPER_TPM, safe_conditioning=0.22, home=(-0.04, 0.04, 0.8))
+    Stack(narrow).start([np.random.default_rng(seed) for seed in range(50)])
+
+
 def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for_ever():
     rngs = [np.random.default_rng(0)]
     with pytest.raises(ConfigurationError, match="'sampled': on 'wide'") as caught:
@@ -155,6 +162,12 @@ def test_machines_on_which_nothing_can_be_drawn_are_told_instead_of_searched_for
     assert caught.value.name == "goal_region"
     with pytest.raises(ConfigurationError, match=r"points of conditioning 0\.9"):
         Reach(replace(PAPER_TPM, safe_conditioning=0.9)).start(rngs)
+    for task in (Stack, Conveyor):
+        with pytest.raises(ConfigurationError, match=r"'sampled': .*'wide'"):
+            task(WIDE_TPM, goals="tempting").start(rngs)
+    with pytest.raises(ConfigurationError, match=r"'narrow' .* conditioning is 0\.5") as caught:
+        Conveyor(replace(PAPER_TPM, name="narrow", safe_conditioning=0.5)).start(rngs)
+    assert caught.value.name == "machine"
 
 
 def test_a_place_from_which_no_block_can_be_pushed_is_refused_by_its_name():

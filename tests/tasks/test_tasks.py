@@ -9,7 +9,7 @@ from machines import each_machine
 from states import random_state
 
 from tpm_gym import TPMEnv, TPMVectorEnv
-from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.simulation.state import Block, Scene, State
@@ -66,6 +66,9 @@ def test_decode_is_the_inverse_of_observe(task):
     for name, value in expected.items():
         np.testing.assert_allclose(decoded[name], value, atol=1e-12)
     assert set(decoded) == {entry.name for entry in task.entries}
+    for wrong in ("seen", [10**400] * task.observation_size, [0.0]):
+        with pytest.raises(InputError, match="observation"):
+            task.decode(wrong)
 
 
 def test_the_observation_never_reads_the_platform_of_the_simulator(task):

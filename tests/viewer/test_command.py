@@ -3,7 +3,10 @@
 import re
 import signal
 import subprocess
+import threading
 import urllib.request
+from contextlib import closing
+from dataclasses import replace
 from functools import partial
 
 import psutil
@@ -11,7 +14,9 @@ import pytest
 from processes import TPM_GYM
 
 from tpm_gym.errors import ConfigurationError
-from tpm_gym.viewer import ViewConfig, run
+from tpm_gym.mechanism import PAPER_TPM, Mount
+from tpm_gym.viewer import ViewConfig, open_viewer, run
+from tpm_gym.viewer.export import export
 
 
 @pytest.fixture
@@ -56,3 +61,20 @@ def test_an_export_replaces_no_page_of_others_and_no_file(tmp_path):
         with pytest.raises(ConfigurationError, match="export"):
             run(ViewConfig(export=folder))
     assert page.read_text() == "<html>mine</html>"
+
+
+def test_a_machine_without_the_task_leaves_no_folder_and_no_server(tmp_path):
+    high, before = replace(PAPER_TPM, mount=Mount(height=1.5)), threading.active_count()
+    with pytest.raises(ConfigurationError, match="cup"):
+        export(tmp_path / "page", high)
+    assert not any(tmp_path.iterdir())
+    assert threading.active_count() == before
+
+
+def test_addresses_of_version_6_are_in_brackets():
+    try:
+        viewer = open_viewer(host="::1", port=0)
+    except ConfigurationError:
+        pytest.skip("no IPv6 here")
+    with closing(viewer), urllib.request.urlopen(viewer.address) as page:
+        assert b"<html" in page.read().lower()

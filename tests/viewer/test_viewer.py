@@ -315,6 +315,8 @@ def test_a_policy_that_is_not_there_is_reported_and_the_viewer_goes_on(viewer):
         ({"port": 70_000}, "port"),
         ({"host": "192.0.2.1"}, "host"),  # an address for documentation
         ({"host": "no such host"}, "host"),
+        ({"host": 70 * "a" + ".b"}, "host"),
+        ({"host": None}, "host"),
     ],
 )
 def test_options_that_are_not_possible_are_refused(options, name):

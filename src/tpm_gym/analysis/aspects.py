@@ -15,7 +15,7 @@ import numpy as np
 
 from tpm_gym.analysis.limits import Limit
 from tpm_gym.analysis.singularity import factors_at
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, is_number, is_whole
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.modes import ELBOWS_OUT, AssemblyMode, WorkingMode
@@ -133,8 +133,6 @@ def aspects(
     Raises:
         ConfigurationError: The shape is not possible, or min_cells is not positive.
     """
-    if min_cells < 1:
-        raise ConfigurationError("min_cells", min_cells, "at least 1")
     low, spacing, codes = _codes(branch, geometry, shape, limits)
     found = []
     for code, cells in regions(low, spacing, codes, min_cells):
@@ -154,7 +152,12 @@ def regions(
         spacing: Edges of a cell, m.
         codes: (nx, ny, nz); negative for cells of no region.
         min_cells: Fewest cells of a region.
+
+    Raises:
+        ConfigurationError: min_cells is no positive whole number.
     """
+    if not is_whole(min_cells, 1):
+        raise ConfigurationError("min_cells", min_cells, "a whole number from 1 up")
     labels = components(codes)
     names, first, counts = np.unique(labels, return_index=True, return_counts=True)
     for index in np.argsort(-counts, kind="stable"):
@@ -173,8 +176,8 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
         ConfigurationError: count is negative, or the aspect has no cells.
     """
     cells = aspect.cells
-    if count < 0:
-        raise ConfigurationError("count", count, "0 or more")
+    if not is_whole(count, 0):
+        raise ConfigurationError("count", count, "a whole number, 0 or more")
     if not cells.mask.any():
         raise ConfigurationError("aspect", "without cells", "an aspect that aspects() returned")
     candidates = np.argwhere(_grown(cells.mask))
@@ -199,7 +202,7 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
         ConfigurationError: The threshold is not between 0 and 1, or no box of at least two nodes
             along each axis meets it.
     """
-    if not 0 <= threshold <= 1:
+    if not is_number(threshold) or not 0 <= threshold <= 1:
         raise ConfigurationError("threshold", threshold, "between 0 and 1")
     cells = aspect.cells
     conditioning = np.full(cells.mask.shape, -1.0)
@@ -215,12 +218,20 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
     return Box(region, float((high - low).prod()), float(conditioning[inside].min()))
 
 
+def require_shape(shape: object, least: int) -> None:
+    """Raise ConfigurationError if the numbers of cells along x, y, z are not possible."""
+    counts = list(shape) if isinstance(shape, (tuple, list, np.ndarray)) else []
+    if len(counts) != 3 or not all(is_whole(count, least) for count in counts):
+        raise ConfigurationError("shape", shape, f"three whole numbers from {least} up")
+
+
 def _codes(
     branch: WorkingMode, geometry: Geometry, shape: Shape, limits: tuple[Limit, ...]
 ) -> tuple[Vector, Vector, IntArray]:
     """Return corner and spacing of the grid, and the signs at the centres of its cells."""
-    if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape) or shape[1] % 2:
-        raise ConfigurationError("shape", shape, "three integers from 2 up, that along y even")
+    require_shape(shape, 2)
+    if shape[1] % 2:
+        raise ConfigurationError("shape", shape, "an even number along y")
     l1, l2, l3, l4, l5, l6, l7 = geometry.lengths
     reach = l3 + l4
     # Leg 2 stays in the plane of its arm, rod 1 spans x_C, and leg 3 stays within a torus.

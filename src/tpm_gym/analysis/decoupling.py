@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from tpm_gym.analysis.aspects import require_shape
 from tpm_gym.arrays import FloatArray, finite_points
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import inverse, jacobian
@@ -77,8 +78,9 @@ def over(
     Raises:
         UnreachableError: If a point is out of reach.
         SingularityError: If a point is singular.
-        ConfigurationError: If a point is in another assembly mode.
+        ConfigurationError: If a point is in another assembly mode, or the shape is not possible.
     """
+    require_shape(shape, 1)
     low, high = np.array(region.low), np.array(region.high)
     cells = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1).reshape(-1, 3)
     points = low + (cells + 0.5) / shape * (high - low)

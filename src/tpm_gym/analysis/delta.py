@@ -5,15 +5,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.analysis.aspects import Cells, Shape, regions
+from tpm_gym.analysis.aspects import Cells, Shape, regions, require_shape
 from tpm_gym.analysis.poc import Chain, parallelogram_4r, parallelogram_4s, revolute
 from tpm_gym.arrays import FloatArray, IntArray, vector
-from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import NUMPY
 from tpm_gym.mechanism.delta.bodies import LEGS, build
 from tpm_gym.mechanism.delta.equations import outwards, pose_at
-from tpm_gym.mechanism.delta.geometry import ELBOWS_OUT, IRB_360, WORKING_MODES, DeltaGeometry
+from tpm_gym.mechanism.delta.geometry import (
+    ELBOWS_OUT,
+    IRB_360,
+    WORKING_MODES,
+    DeltaGeometry,
+    require_bends,
+    require_delta,
+    require_side,
+)
 from tpm_gym.mechanism.delta.kinematics import factors_at, inverse_all, no_assembly
 
 
@@ -33,6 +40,8 @@ def chains(
         InputError: If theta is not three finite numbers.
         UnreachableError: If the Delta cannot be assembled at theta.
     """
+    require_delta(geometry)
+    require_side(side)
     angles, g = vector("theta", theta), geometry
     pose, real = pose_at(tuple(map(np.float64, angles)), side, g, NUMPY)
     if not real:
@@ -97,7 +106,8 @@ def aspects(
         min_cells: Fewest cells of an aspect.
 
     Raises:
-        ConfigurationError: The shape is not possible.
+        ConfigurationError: The shape is not possible, or min_cells is not positive.
+        InputError: bends or geometry are not of a Delta.
     """
     grid = _codes(bends, geometry, shape, within_stops)
     return tuple(
@@ -110,8 +120,8 @@ def _codes(
     bends: Triple, geometry: DeltaGeometry, shape: Shape, within_stops: bool
 ) -> tuple[Triple, Triple, IntArray]:
     """Return corner and spacing of the grid, and the signs at its cells; -1 where P cannot be."""
-    if len(shape) != 3 or any(int(n) != n or n < 2 for n in shape):
-        raise ConfigurationError("shape", shape, "three integers from 2 up")
+    require_delta(geometry)
+    require_shape(shape, 2)
     far, aside = geometry.l3 + geometry.l4, abs(geometry.l1 - geometry.l2)
     low = -np.array([far + aside, far + aside, far])
     spacing = -2 * low / shape
@@ -120,7 +130,7 @@ def _codes(
     values = np.stack([found.parallel, found.constraint], axis=-1)
     there = ~np.isnan(values[..., 0])
     if within_stops:
-        theta = inverse_all(points, geometry)[..., WORKING_MODES.index(bends), :]
+        theta = inverse_all(points, geometry)[..., WORKING_MODES.index(require_bends(bends)), :]
         low_stops, high_stops = np.array(build(geometry).stops).T
         there &= ((theta >= low_stops) & (theta <= high_stops)).all(axis=-1)
     codes: IntArray = np.where(there, (values > 0) @ (1, 2), -1)

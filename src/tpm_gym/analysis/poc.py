@@ -23,7 +23,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, numbers
+from tpm_gym.arrays import FloatArray, finite, finite_points, numbers
 from tpm_gym.errors import InputError
 
 # Directions closer than this (sine of the angle) are equal, and shorter vectors are zero. It is far
@@ -48,7 +48,7 @@ class Subspace:
         rows = finite_points("vectors", rows if rows.size else rows.reshape(0, 3))
         if rows.ndim != 2:
             raise InputError("shape of vectors", rows.shape, "(n, 3)")
-        lengths = np.linalg.norm(rows, axis=1)
+        lengths = np.hypot.reduce(rows, axis=1)  # without overflow
         rows = rows[lengths > _SAME] / lengths[lengths > _SAME, None]
         _, values, right = np.linalg.svd(rows)
         return cls(right[: int((values > _SAME).sum())])
@@ -127,7 +127,7 @@ class Unit:
 
     def poc(self, base_point: ArrayLike) -> POCSet:
         """Return M_Ji of Eq. (1) about ``base_point`` (3,) m of the chain's end link."""
-        arm = np.asarray(base_point, dtype=np.float64) - self.point
+        arm = finite("base_point", base_point, (3,)) - self.point
         carried = np.concatenate([self.translations, np.cross(self.rotations, arm)])
         return POCSet(Subspace.span(carried), Subspace.span(self.rotations))
 

@@ -15,7 +15,8 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from tpm_gym.arrays import FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.errors import InputError
 from tpm_gym.kinematics.equations import Factors
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
@@ -149,8 +150,10 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
     table = np.array(rows, dtype=np.float64).reshape(-1, 4).T
     arcs, t = _Arcs(_CURVES[factor], geometry, mode, *table), np.linspace(0, np.pi, _FINE + 1)
     points = arcs.at(np.arange(len(rows)), np.broadcast_to(t, (len(rows), len(t))))
-    chords = np.hypot(*np.diff(points[:2])).reshape(len(rows), _CELLS, -1)
+    chords = np.hypot(*np.diff(points[:2])).reshape(len(rows), _CELLS, _FINE // _CELLS)
     x, z, p, q = (part[:, :: _FINE // _CELLS] for part in points)
+    for part in (x, z, p, q):
+        part.flags.writeable = False  # they serve all callers
     return arcs, (x, z, p, q), chords.sum(-1)
 
 
@@ -161,7 +164,12 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
         mode: The working mode. Points of other working modes are included; see :data:`Point`.
         geometry: Link lengths.
+
+    Raises:
+        InputError: If no curve belongs to a factor of this name.
     """
+    if factor not in _CURVES:
+        raise InputError("factor", factor, f"one of {', '.join(_CURVES)}")
     return _arcs(geometry, mode, factor)[1]
 
 
@@ -242,19 +250,38 @@ def _feet(
         radius = np.hypot(level, rows[..., 1])
         return np.hypot(radius - g.l7, rows[..., 2] - z), level, radius
 
+    def belongs(point: Point, level: FloatArray, radius: FloatArray) -> BoolArray:
+        """Return whether points of a curve belong to the working mode."""
+        ours: BoolArray = (point[2] * radius + point[3] * level > 0) & (mode.cos_beta * level > 0)
+        return ours
+
     # Enter each cell that can hold a nearer point than the nearest so far, by its ends and length.
     ends, level, radius = offset(link3[:, None, None], x, z)
-    ours = (p * radius + q * level > 0) & (mode.cos_beta * level > 0)
+    ours = belongs((x, z, p, q), level, radius)
     known = np.minimum(limit, np.where(ours, ends, np.inf).min(axis=(1, 2), initial=np.inf))
     least = (ends[..., :-1] + ends[..., 1:] - length) / 2
     row, arc, cell = np.nonzero(least <= known[:, None, None])
-    here, step = link3[row][:, None], np.pi / _CELLS
-    low = cell.astype(np.float64) * step
+    step = np.pi / _CELLS
+    low, all_ = cell.astype(np.float64) * step, np.arange(len(cell))
 
-    t = _zoom(lambda t: offset(here, *arcs.at(arc, t)[:2])[0], low, low + step)
-    x, z, p, q = arcs.at(arc, t)
-    _, level, radius = offset(link3[row], x, z)
-    real = (p * radius + q * level > 0) & (mode.cos_beta * level > 0)
+    def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
+        """Return points at t (k, ...) of cells (k,), offsets, and whether they belong here."""
+        point, rows = arcs.at(arc[cells], t), link3[row[cells]]
+        found = offset(rows[:, None] if t.ndim > 1 else rows, *point[:2])
+        return point, found, belongs(point, *found[1:])
+
+    t = _zoom(lambda t: on(all_, t)[1][0], low, low + step)
+    # Where the nearest point of a cell is of another mode, find the nearest one of this mode.
+    either = ours[row, arc, cell] | ours[row, arc, cell + 1]
+    split = np.flatnonzero(either & ~on(all_, t)[2])
+
+    def within(t: FloatArray) -> FloatArray:
+        _, (apart, *_), real = on(split, t)
+        return np.where(real, apart, np.inf)
+
+    if len(split):
+        t[split] = _zoom(within, low[split], low[split] + step)
+    (x, z, *_), (_, level, radius), real = on(all_, t)
     scale = g.l7 / np.where(radius > 0, radius, 1.0)
     foot = np.stack([x + level * scale + g.l2, points[row, 1] * scale, z + 2 * g.l6], axis=-1)
     reach = np.linalg.norm(foot - points[row], axis=-1)

@@ -17,13 +17,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tpm_gym.analysis import sheets
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, is_number, numbers
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics import equations, inverse
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.jacobian import Factors, factors
 from tpm_gym.kinematics.jacobian import factors_at as factors_at
-from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
+from tpm_gym.kinematics.modes import (
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    AssemblyMode,
+    WorkingMode,
+    require_mode,
+)
 
 FACTORS = equations.Factors._fields
 """Names of the factors, in the order of every axis of length 8: 3 parallel, 4 serial, elevation."""
@@ -97,7 +103,7 @@ def classify(
     merge, a factor computed from joint angles has an error of about the square root of the
     rounding error.
     """
-    return _classify(factors(theta, branch, geometry), geometry, tolerance)
+    return _classify(factors(numbers("theta", theta), branch, geometry), geometry, tolerance)
 
 
 def classify_at(
@@ -111,8 +117,9 @@ def classify_at(
     The factor of a leg grows as the square root of the distance to its boundary: 1e-12 m from the
     boundary it is 1e-6.
     """
-    inverse(position, branch, geometry)  # raises UnreachableError with the reason
-    return _classify(factors_at(position, branch, geometry), geometry, tolerance)
+    points = numbers("position", position)
+    inverse(points, branch, geometry)  # raises UnreachableError with the reason
+    return _classify(factors_at(points, branch, geometry), geometry, tolerance)
 
 
 def nearest_singularity(
@@ -128,7 +135,8 @@ def nearest_singularity(
     are exact, the others numerical. Points that are not finite, or not on both branches, are not
     valid.
     """
-    points = np.array(position, dtype=np.float64)
+    require_mode(assembly, AssemblyMode)
+    points = numbers("position", position)
     values = dimensionless(factors_at(points, branch, geometry), geometry)
     with np.errstate(invalid="ignore"):
         valid = values[..., _PLANAR] * assembly.planar >= 0
@@ -148,7 +156,7 @@ def nearest_singularity(
 
 
 def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classification:
-    if not 0 < tolerance < 1:
+    if not is_number(tolerance) or not 0 < tolerance < 1:
         raise ConfigurationError("tolerance", tolerance, "a number between 0 and 1")
     scaled = dimensionless(values, geometry)
     vanishing = np.abs(scaled) <= tolerance

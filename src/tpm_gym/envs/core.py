@@ -124,6 +124,7 @@ class Core:
         self.machine = self.task.machine
         self.control = make_control(control, self.machine, self.task.control_period)
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
+        self.randomisation.require_fitting(self.machine)
         self._altered = self.randomisation != Randomisation()
         self._follower = self._make_follower()
         self._shield = None if shield is False else self._make_shield(shield)
@@ -155,6 +156,7 @@ class Core:
         self._pending = np.zeros((self.randomisation.latency, count, self.task.action_size))
         # Objects in the last control steps, oldest first, if the camera is late
         self._views = np.zeros((self.task.camera_delay, count, len(self.task.scene.objects), 9))
+        self._newest = self._views[:1]  # a copy, as users may change arrays of the state
         self.simulation = self._start()
 
     def _make_shield(self, shield: bool | float) -> Shield | BrakingShield:
@@ -202,7 +204,7 @@ class Core:
             UnreachableError: If an object or the goal is out of reach; nothing has happened then.
         """
         self.require_open()
-        before = [rng.bit_generator.state for rng in rngs] if options else []
+        before = [rng.bit_generator.state for rng in rngs] if options is not None else []
         try:
             starts = self.task.start(rngs, options)
         except BaseException:
@@ -249,7 +251,7 @@ class Core:
             commands = self._shield.command(commands, simulation.recent)
         vacuum = actions[:, 3] > 0 if self.task.vacuum else np.zeros(self.count, dtype=np.bool_)
         if len(self._views):
-            self._views = np.concatenate([self._views[1:], _view(simulation.state())[None]])
+            self._views = np.concatenate([self._views[1:], self._newest])
         self._state = None
         noisy = self.randomisation.encoder_noise > 0
         simulation.move(commands, vacuum, self._noise(running) if noisy else None)
@@ -264,7 +266,7 @@ class Core:
         state, goals = self.simulation.state(), self.goals
         self._state = seen = state
         if len(self._views):
-            seen = _seen(state, self._views[0])
+            seen, self._newest = _seen(state, self._views[0]), _view(state)[None]
         if rows is not None:
             state, seen, goals = state.take(rows), seen.take(rows), goals[rows]
         task = self.task
@@ -365,6 +367,7 @@ class Core:
         """Return a snapshot; read :attr:`state` again, since saving restarts the simulation."""
         snapshot = self.simulation.save()
         self._state = self.simulation.state()
+        self._newest = _view(self._state)[None]
         return snapshot
 
     def restore(self, snapshot: Any) -> Observation:
@@ -500,7 +503,7 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
         else:
             others = [float(_goal_free(entry.get("reward_terms", {}))) for entry in info]
             other = np.array(others).reshape(goal_term.shape)
-    except (AttributeError, TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
         valid = f"a step's info, or one for each of the {goal_term.size} transitions"
         raise InputError("info", type(info), valid) from error
     total = goal_term + other

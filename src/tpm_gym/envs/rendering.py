@@ -39,7 +39,8 @@ class Rendering:
                 valid = "a whole number of pixels from 16 to 4096"
                 raise ConfigurationError(name, value, valid)
         camera = camera_of(camera, machine)
-        self.view = View(camera, int(width), int(height), mode == "segmentation")
+        segmented = mode in ("depth_array", "rgbd_tuple", "segmentation")
+        self.view = View(camera, int(width), int(height), segmented)
 
     def frame(self, simulation: Simulation, row: int, markers: ArrayLike) -> Any:
         """Draw a frame of the mode; ``markers`` (k, 3) m are the goal markers.

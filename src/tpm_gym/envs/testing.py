@@ -297,7 +297,7 @@ def refuses_bad_options_and_keeps_the_episode_then(make: Make) -> None:
         bare: Any = env.unwrapped
         blocks, size = bare.task.scene.objects, bare.task.goal_size
         home = bare.machine.mount.to_world(bare.machine.home)
-        bad: list[Any] = [{"colour": "red"}, ["goal"], 7]
+        bad: list[Any] = [{"colour": "red"}, ["goal"], 7, np.zeros(2)]
         for name, length in (("goal", size), *((block.name, 3) for block in blocks)):
             numbers = ([5.0] * length, [np.nan] * length, [0.0] * (length + 1), [10**400] * length)
             bad += [{name: value} for value in (*numbers, "there", None)]

@@ -32,6 +32,8 @@ _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
 """Limit below which a factor of det A counts as zero. cos(beta) has an error of about 1e-14. Where
 cos(beta) is 1, the error of sin(beta) is the square root of that (50 nm in y)."""
+LEAST = 1e-30
+"""Smallest det A, m^3, for which the conditioning is computed; below, its terms could overflow."""
 
 _TINY = sys.float_info.min  # the smallest divisor
 

@@ -21,7 +21,13 @@ from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Factors as Factors
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
-from tpm_gym.kinematics.modes import DEFAULT_ASSEMBLY, ELBOWS_OUT, AssemblyMode, WorkingMode
+from tpm_gym.kinematics.modes import (
+    DEFAULT_ASSEMBLY,
+    ELBOWS_OUT,
+    AssemblyMode,
+    WorkingMode,
+    require_mode,
+)
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows
 
 
@@ -133,6 +139,7 @@ def conditioning_at(
     To differentiate by the lengths, pass points as a tensor and the lengths as tensors in a
     :class:`tpm_gym.kinematics.geometry.Lengths`.
     """
+    require_mode(assembly, AssemblyMode)
 
     def results(c: _Configuration) -> list[Numbers]:
         planar, side = (2.0 * (f > 0) - 1.0 for f in (c.factors.planar, c.factors.sin_beta))
@@ -196,6 +203,7 @@ def _from_angles(
         found, real, _ = equations.assembly_at(cos, sin, branch.planar, branch.sin_beta, g, ns)
         return [ns.where(real, 0.0, 1.0), *results(_configuration(cos, sin, found, g, ns))]
 
+    require_mode(branch, AssemblyMode)
     angles = finite_points("theta", theta)
     missing, *found = by_rows(text, angles)
     if missing.any():
@@ -214,6 +222,7 @@ def _from_points(
         found = _configuration(cos, sin, equations.Assembly(*point, *link7), g, ns)
         return [ns.where(real, column, missing) for column in results(found)]
 
+    require_mode(branch, WorkingMode)
     return by_rows(text, points("position", position))
 
 
@@ -235,5 +244,10 @@ def _velocity(c: _Configuration) -> Numbers:
 
 def _conditioning(c: _Configuration) -> Numbers:
     """Compute the conditioning, and 0 where J does not exist."""
-    found = equations.conditioning(equations.velocity(c.rods, c.factors), c.ns)
-    return c.ns.where(found <= 1.0, found, 0.0)
+    values, ns = c.factors, c.ns
+    exists = abs(values.planar * values.sin_beta * values.level3) > equations.LEAST
+    # Otherwise, the derivatives of all rows by the lengths would be NaN.
+    sin_beta, level3, planar = (ns.where(exists, value, 1.0) for value in values[:3])
+    values = values._replace(sin_beta=sin_beta, level3=level3, planar=planar)
+    found = equations.conditioning(equations.velocity(c.rods, values), ns)
+    return ns.where(exists & (found <= 1.0), found, 0.0)

@@ -11,7 +11,7 @@ Branches are named by signs that change only at a singularity:
 from dataclasses import dataclass
 from itertools import product
 
-from tpm_gym.arrays import BoolArray, FloatArray
+from tpm_gym.arrays import BoolArray, FloatArray, brief
 from tpm_gym.errors import InputError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.namespaces import namespace_of
@@ -86,6 +86,12 @@ class RotatedMode(_Mode):
     planar: int
     further: int
     sin_beta: int
+
+
+def require_mode(branch: object, kind: type[_Mode]) -> None:
+    """Raise InputError if a branch is no mode of this kind."""
+    if not isinstance(branch, kind):
+        raise InputError("branch", brief(branch), f"a tpm_gym.kinematics.{kind.__name__}")
 
 
 ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))

@@ -96,6 +96,10 @@ def _torch() -> Namespace:
     def like(x: Any, other: Any) -> Any:
         return torch.as_tensor(x, dtype=other.dtype, device=other.device)
 
+    def sqrt(x: Any) -> Any:
+        none = x == 0
+        return torch.where(none, 0.0, torch.where(none, 1.0, x).sqrt())
+
     def root(x: Any) -> Any:
         none = x <= 0
         return torch.where(none, 0.0, torch.where(none, 1.0, x).sqrt())
@@ -113,7 +117,7 @@ def _torch() -> Namespace:
         cos=torch.cos,
         sin=torch.sin,
         arctan2=lambda y, x: torch.arctan2(y, like(x, y)),
-        sqrt=torch.sqrt,
+        sqrt=sqrt,
         root=root,
         clip=lambda x: torch.clip(x, -1.0, 1.0),
         arccos=arccos,

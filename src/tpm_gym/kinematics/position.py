@@ -26,6 +26,7 @@ from tpm_gym.kinematics.modes import (
     ForwardSolutions,
     InverseSolutions,
     WorkingMode,
+    require_mode,
 )
 from tpm_gym.kinematics.namespaces import Namespace, by_rows
 
@@ -64,6 +65,7 @@ def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
     """Compute angles (..., 3) rad, in the ranges of :class:`.InverseSolutions`, on one branch."""
+    require_mode(branch, WorkingMode)
     places = finite_points("position", position)
     solutions = inverse_all(places, geometry)
     valid = solutions.valid[..., branch.index]
@@ -74,6 +76,7 @@ def inverse(
 
 def assembled(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> ForwardSolutions:
     """Compute all solutions; raise UnreachableError where ``branch`` does not exist."""
+    require_mode(branch, AssemblyMode)
     angles = finite_points("theta", theta)
     solutions = forward_all(angles, geometry)
     valid = solutions.valid[..., branch.index]

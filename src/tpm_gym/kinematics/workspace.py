@@ -6,16 +6,18 @@ Everything here is in the paper frame, in metres, on one working mode.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, vector
+from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector, numbers, vector
+from tpm_gym.arrays import points as _points
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.kinematics.geometry import PAPER, Geometry
 from tpm_gym.kinematics.jacobian import conditioning_at as conditioning_at
 from tpm_gym.kinematics.jacobian import factors_at
-from tpm_gym.kinematics.modes import ELBOWS_OUT, WorkingMode
+from tpm_gym.kinematics.modes import ELBOWS_OUT, WorkingMode, require_mode
 from tpm_gym.kinematics.namespaces import namespace_of
 from tpm_gym.kinematics.position import inverse_all
 
@@ -44,13 +46,18 @@ class Region:
 
     def contains(self, points: ArrayLike) -> BoolArray:
         """Return whether points (..., 3) are inside, as (...,)."""
-        array = np.asarray(points, dtype=np.float64)
+        array = _points("points", numbers("points", points))
         inside: BoolArray = np.all((array >= self.low) & (array <= self.high), axis=-1)
         return inside
 
     def project(self, points: ArrayLike) -> FloatArray:
         """Return the nearest points of the box to points (..., 3)."""
-        return np.minimum(np.maximum(points, self.low), self.high)
+        array: Any = points
+        plain = type(points) is np.ndarray and points.dtype.char == "d"  # the common case, fast
+        if not plain or array.shape[-1:] != (3,):
+            array = _points("points", numbers("points", points))
+        nearest: FloatArray = np.minimum(np.maximum(array, self.low), self.high)
+        return nearest
 
     def corners(self) -> Iterator[Vector]:
         """Yield the eight corners, m."""
@@ -61,6 +68,7 @@ def reachable(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> BoolArray:
     """Return whether points (..., 3) m have a posture on ``branch``, as (...,)."""
+    require_mode(branch, WorkingMode)
     return inverse_all(position, geometry).valid[..., branch.index]
 
 

@@ -6,16 +6,21 @@ Vectors are in the base's frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final
+from typing import Final, get_args, get_type_hints
 
 import numpy as np
 
 from tpm_gym.arrays import FloatArray, Vector
 from tpm_gym.errors import ConfigurationError, SingularityError
-from tpm_gym.mechanism.bodies import Joint, Mechanism, Place
+from tpm_gym.mechanism.bodies import Joint, Mechanism, Place, Solid
 
 CLOSED: Final = 1e-6
 """Largest gap of a closed loop, m."""
+
+_SOLIDS, _AXES, _JOINTS = (
+    get_args(get_type_hints(kind)[name])
+    for kind, name in ((Solid, "kind"), (Solid, "axis"), (Joint, "kind"))
+)
 
 # Fractions of the largest singular value: zero up to the first, not zero from the second, and
 # uncertain in between. Rounding makes zeros of about 1e-16.
@@ -83,9 +88,11 @@ def require_sound(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
         ConfigurationError: If a name is missing or not unique, a link comes before its parent, a
             loop is open at these joint positions, the platform turns, or the motors, or
             motors and platform together, do not have exactly three degrees of freedom. Redundant
-            closure equations are allowed; the TPM has one.
+            closure equations are allowed; the TPM has one. Or if a joint or a solid is of an
+            unknown kind, an axis has not length 1, or a solid has no positive size.
         SingularityError: If the rank of the closures' Jacobian is uncertain at these positions.
     """
+    _require_parts(mechanism)
     _require_tree(mechanism, joints)
     places = mechanism.places(joints)
     for closure in mechanism.closures:
@@ -109,6 +116,20 @@ def require_sound(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
             raise ConfigurationError("mechanism", what, valid)
     if np.abs(angular @ free).max() > _NOT_ZERO:
         raise ConfigurationError("mechanism", mechanism.platform, "a platform that does not turn")
+
+
+def _require_parts(mechanism: Mechanism) -> None:
+    """Refuse joints and solids that engines would read in different ways, or not at all."""
+    for link in mechanism.links:
+        for solid in link.solids:
+            known = solid.kind in _SOLIDS and solid.axis in _AXES
+            if not known or not (solid.half_extent > 0).all() or not (solid.moments >= 0).all():
+                valid = "boxes and cylinders along x, y or z, of positive size, with a smaller bore"
+                raise ConfigurationError("mechanism", (link.name, solid), valid)
+        joint = link.joint
+        if joint and (joint.kind not in _JOINTS or not abs(np.linalg.norm(joint.axis) - 1) < 1e-9):
+            valid = f"{', '.join(_JOINTS)} joints with an axis of length 1"
+            raise ConfigurationError("mechanism", joint, valid)
 
 
 def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:

@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray
-from tpm_gym.errors import InputError
+from tpm_gym.arrays import BoolArray, FloatArray, numbers
+from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
@@ -143,6 +143,9 @@ class CompiledMachine(Machine):
 
     def with_lengths(self, lengths: tuple[float, ...]) -> CompiledMachine:
         """Return the machine with these lengths, m."""
+        if len(lengths) != len(self.lengths):
+            valid = f"{len(self.lengths)} lengths, like those of {self.name}"
+            raise ConfigurationError("lengths", lengths, valid)
         return replace(self, geometry=type(self.geometry)(*lengths))
 
     def built(
@@ -175,7 +178,8 @@ def _loops_of(module: str) -> Any:
 
 def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArray:
     """Convert vectors (..., length) to the type of array for which the loops are compiled."""
-    array = np.ascontiguousarray(values, np.float64)
+    plain = type(values) is np.ndarray and values.dtype.char == "d"  # the common case, fast
+    array = np.ascontiguousarray(values if plain else numbers(name, values))
     if array.shape[-1] != length:
         raise InputError(f"shape of {name}", array.shape, f"(..., {length})")
     return array if array.flags.writeable else array.copy()
@@ -183,8 +187,15 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
 
 def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
     """Repeat vectors up to the shape of an array (..., 3)."""
-    array = np.asarray(values)  # broadcast_to() is slow, and its result has to be copied
-    return _rows(array if array.shape == like.shape else np.broadcast_to(array, like.shape))
+    plain = type(values) is np.ndarray and values.dtype.char == "d"  # the common case, fast
+    array: Any = values if plain else numbers("vectors", values)
+    if array.shape != like.shape:  # broadcast_to() is slow, and its result has to be copied
+        try:
+            array = np.broadcast_to(array, like.shape)
+        except ValueError as error:
+            valid = f"{like.shape}, like theta, or one that broadcasts to it"
+            raise InputError("shape of vectors", array.shape, valid) from error
+    return _rows(array)
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:

@@ -83,12 +83,13 @@ class EquationOfMotion(ABC):
     _formulas: ClassVar[Formulas]
 
     def __post_init__(self) -> None:
-        """Reject masses that are not possible."""
+        """Reject masses that are not possible; arrays become tuples."""
         if finite("payload", self.payload, (), ConfigurationError) < 0:
             raise ConfigurationError("payload", self.payload, "at least 0 kg")
         factors = numbers("link_masses", self.link_masses, ConfigurationError)
         if factors.ndim != 1 or not ((factors > 0) & (factors < math.inf)).all():
             raise ConfigurationError("link_masses", self.link_masses, "positive factors")
+        object.__setattr__(self, "link_masses", tuple(factors.tolist()))
         vector("free_fall", self.free_fall, ConfigurationError)
 
     @cached_property

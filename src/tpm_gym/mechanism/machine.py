@@ -21,7 +21,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, first_row, vector
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, first_row, numbers, points, vector
 from tpm_gym.errors import (
     ConfigurationError,
     JointLimitError,
@@ -259,11 +259,12 @@ class Machine(ABC):
         Raises:
             JointLimitError: If a joint position is beyond a stop.
         """
+        theta = points("theta", numbers("theta", theta))
         lower, upper = self.stops
         within = (theta >= lower) & (theta <= upper)
         if not within.all():
             index = int(np.argwhere(~within)[0, -1])
-            motor, position = self.mechanism.motors[index], np.asarray(theta)[~within][0]
+            motor, position = self.mechanism.motors[index], theta[~within][0]
             ends = float(lower[index]), float(upper[index])
             raise JointLimitError(motor.name, float(position), *ends, motor.unit)
 
@@ -397,7 +398,7 @@ class Machine(ABC):
         Args:
             position: Point P (3,) m, machine's frame.
         """
-        a, b, c = self.require_inverse(position).tolist()
+        a, b, c = self.require_inverse(vector("position", position)).tolist()
         places = self.mechanism.places(self.joint_positions((a, b, c)))
         boxes = []
         for name in (self.mechanism.platform, self.mechanism.tool):

@@ -22,6 +22,8 @@ from tpm_gym.simulation.settings import settings_of
 if TYPE_CHECKING:
     from tpm_gym.simulation.engine import Path
 
+_LARGEST = 1e12  # N m/rad and N m s/rad; far larger ones overflow
+
 FEEDFORWARDS = ("none", "gravity", "computed")
 
 
@@ -38,8 +40,8 @@ class Servo:
     singularity, the inertia is up to 150 times larger, so motions are slower and less damped.
 
     Attributes:
-        stiffness: Stiffness, N m/rad.
-        damping: Damping, N m s/rad.
+        stiffness: Stiffness, N m/rad; at most 1e12.
+        damping: Damping, N m s/rad; at most 1e12.
         feedforward: Torques of the nominal machine that are fed forward: ``"none"``, ``"gravity"``
             (torques at rest), or ``"computed"`` (torques of the whole motion).
 
@@ -55,8 +57,8 @@ class Servo:
         """Check the values."""
         for name in ("stiffness", "damping"):
             value = getattr(self, name)
-            if not is_number(value) or not value > 0:
-                raise ConfigurationError(name, value, "a positive number")
+            if not is_number(value) or not 0 < value <= _LARGEST:
+                raise ConfigurationError(name, value, f"a positive number, at most {_LARGEST:g}")
         if self.feedforward not in FEEDFORWARDS:
             valid = ", ".join(map(repr, FEEDFORWARDS))
             raise ConfigurationError("feedforward", self.feedforward, valid)

@@ -140,7 +140,7 @@ class View(NamedTuple):
         camera: Camera, in the world frame.
         width: Width, pixels.
         height: Height, pixels.
-        segmented: Whether the ids of bodies are wanted.
+        segmented: Whether the ids of bodies are wanted, and a depth whose edges are theirs.
     """
 
     camera: Camera

@@ -137,6 +137,13 @@ class Randomisation:
             raise ConfigurationError("latency", self.latency, valid)
         object.__setattr__(self, "latency", int(self.latency))
 
+    def require_fitting(self, machine: Machine) -> None:
+        """Raise ConfigurationError if length errors could make a length of a machine negative."""
+        shortest = min(machine.lengths, default=1.0)
+        if self.length_error > shortest:
+            valid = f"at most the shortest length of {machine.name!r}, {shortest:.6g} m"
+            raise ConfigurationError("length_error", self.length_error, valid)
+
     def draw(self, rng: np.random.Generator, machine: Machine) -> Plant:
         """Draw the plant of one episode; attributes that are not randomised do not use ``rng``."""
         if self == _NOTHING:

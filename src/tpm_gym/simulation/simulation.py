@@ -157,7 +157,8 @@ class Simulation:
         Raises:
             ConfigurationError: If a plant needs servo drives, but the drives are ideal, or a speed
                 is given for a scene without a belt.
-            InputError: If theta or a position is not three finite numbers.
+            InputError: If theta or a position is not three finite numbers, or the scene has no
+                object of a name; no robot has moved then.
             UnreachableError: If a robot cannot be assembled at theta; no robot has moved then.
             JointLimitError: If a motor is beyond a stop at theta; no robot has moved then.
         """
@@ -178,10 +179,11 @@ class Simulation:
             lengths = [plant.lengths_of(self.machine) for plant in plants]
             self.machine.require_evaluate(true, np.array([*map(self.machine.built, lengths)]))
         placed = self._places(len(rows), objects or {})
-        self._become(rows, plants)
         if self.scene.belt is not None:
             speeds = np.zeros(len(rows)) if belt_speed is None else belt_speed
             self._belt_speed[rows] = self.scene.belt.require(speeds, len(rows), InputError)
+        self._become(rows, plants)
+        if self.scene.belt is not None:
             self.engine.set_belt(rows, self._belt_speed[rows])
         self.engine.place(rows, true, placed)
         self._commands[rows] = reading.position[..., None, :]
@@ -201,6 +203,9 @@ class Simulation:
         """Return upright poses (r, k, 7) of the objects, in the order of the scene."""
         places = np.zeros((count, len(self.scene.objects), 7))
         places[..., 6] = 1.0
+        names = [block.name for block in self.scene.objects]
+        if not set(names).issuperset(objects):
+            raise InputError("objects", list(objects), f"of objects of the scene: {names}")
         for index, block in enumerate(self.scene.objects):
             places[:, index, 2] = block.height / 2
             if block.name in objects:

@@ -12,6 +12,8 @@ from tpm_gym.errors import ConfigurationError, InputError
 CONTROL_PERIOD = 1 / 25
 """Control period of tasks that set no other: time between two commands, s."""
 
+_LIGHTEST, _HEAVIEST, _ROUGHEST = 1e-6, 1e6, 1e6  # of blocks, kg, and their largest friction
+
 
 @dataclass(frozen=True)
 class Block:
@@ -24,8 +26,8 @@ class Block:
         name: Key in ``reset(options=...)``; unique in its scene.
         width: Edge length of the base, m.
         height: Height, m.
-        mass: Mass, kg.
-        friction: Coulomb coefficient against the table.
+        mass: Mass, 1e-6 to 1e6 kg.
+        friction: Coulomb coefficient against the table, at most 1e6.
         colour: Red, green, blue and opacity, each from 0 to 1.
 
     Raises:
@@ -45,9 +47,13 @@ class Block:
             raise ConfigurationError("name", self.name, "a name")
         for name in ("width", "height", "mass", "friction"):
             _require_positive(name, getattr(self, name))
-        colour = finite("colour", self.colour, (4,), ConfigurationError)
-        if not ((colour >= 0) & (colour <= 1)).all():
-            raise ConfigurationError("colour", self.colour, "four numbers from 0 to 1")
+        # Engines compute no contacts of far lighter, heavier or rougher blocks.
+        if not _LIGHTEST <= self.mass <= _HEAVIEST:
+            valid = f"a number from {_LIGHTEST:g} to {_HEAVIEST:g} kg"
+            raise ConfigurationError("mass", self.mass, valid)
+        if self.friction > _ROUGHEST:
+            raise ConfigurationError("friction", self.friction, f"at most {_ROUGHEST:g}")
+        _require_colour(self.colour)
 
     @property
     def half(self) -> Vector:
@@ -111,11 +117,22 @@ class Patch:
         low: Lowest x and y, m, world.
         high: Highest x and y, m, world.
         colour: Red, green, blue and opacity, each from 0 to 1.
+
+    Raises:
+        ConfigurationError: If a value is out of range.
     """
 
     low: tuple[float, float]
     high: tuple[float, float]
     colour: tuple[float, float, float, float]
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        low = finite("low", self.low, (2,), ConfigurationError)
+        high = finite("high", self.high, (2,), ConfigurationError)
+        if not (low < high).all():
+            raise ConfigurationError("high", self.high, f"above low, {self.low}")
+        _require_colour(self.colour)
 
 
 @dataclass(frozen=True)
@@ -148,6 +165,11 @@ class Scene:
         ):
             valid = "a tuple of blocks, each with a name of its own, other than goal, belt_speed"
             raise ConfigurationError("objects", self.objects, valid)
+        if self.belt is not None and not isinstance(self.belt, Belt):
+            raise ConfigurationError("belt", self.belt, "None or a Belt")
+        patches = isinstance(self.patches, tuple)
+        if not patches or not all(isinstance(patch, Patch) for patch in self.patches):
+            raise ConfigurationError("patches", self.patches, "a tuple of Patch")
         if not is_whole(self.markers, 0):
             raise ConfigurationError("markers", self.markers, "a whole number, 0 or more")
         _require_positive("marker_radius", self.marker_radius)
@@ -212,6 +234,12 @@ class State:
     def passed_singularity(self) -> BoolArray:
         """Whether each robot left its assembly or working mode in this episode, (n,)."""
         return self.assembly_mode_changed | self.working_mode_changed
+
+
+def _require_colour(colour: Any) -> None:
+    values = finite("colour", colour, (4,), ConfigurationError)
+    if not ((values >= 0) & (values <= 1)).all():
+        raise ConfigurationError("colour", colour, "four numbers from 0 to 1")
 
 
 def _require_positive(name: str, value: float) -> None:

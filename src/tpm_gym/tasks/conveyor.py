@@ -164,14 +164,14 @@ class Conveyor(Task):
         yield from [Move(place, True), Move(place, True), Move(place, False)]  # the platform lags
 
     def _pick(self, camera: _Camera, leave: list[FloatArray]) -> Iterator[Move]:
-        """Wait where the belt comes within reach, follow the block, and seal the cup."""
+        """Wait until the block is within reach or stands still, follow it, and seal the cup."""
         motion, first = camera.motion, self._floor[0][0]
         gate = camera.above(CLEARANCE)
         gate[0] = self.machine.mount.to_paper(np.array([first, 0.0, 0.0]))[0]
         lifting = len(motion.trapezoid(motion.command, *leave)) if leave else 0
         way = motion.go([*leave, gate], vacuum=False, rounded=True)
         for step, move in enumerate(chain(way, repeat(Move(gate, False)))):
-            if step >= lifting and camera.place()[0] >= first:
+            if step >= lifting and (camera.place()[0] >= first or abs(camera.step()).max() < 1e-6):
                 break
             yield move
         yield from motion.meet(partial(camera.above, 0.0), camera.step(), UP)

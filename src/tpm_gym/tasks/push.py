@@ -11,7 +11,7 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray
 from tpm_gym.errors import ConfigurationError, ResetOptionError
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.simulation.state import Block, Scene, State
+from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task, dense
@@ -26,7 +26,7 @@ LONGEST: Final = 0.240
 SLOPE: Final = 0.10
 """Largest tangent of the angle between the block's path and the normal of the pushed face."""
 PACE: Final = 0.014
-"""Distance that the expert moves the lip in a control step while it pushes, m."""
+"""Distance that the expert moves the lip in 40 ms while it pushes, m."""
 SIDEWAYS: Final = 0.15
 """Largest tangent of the angle between the expert's push and the line from start to goal."""
 CLOSE: Final = 0.001
@@ -127,7 +127,7 @@ class Push(Task):
     def plan(self, motion: Motion) -> Iterator[Move]:
         """Come down behind the block, push it to the goal, and stay."""
         to_paper = motion.machine.mount.to_paper
-        start = motion.seen["object_position"]
+        start, pace = motion.seen["object_position"], PACE * motion.period / CONTROL_PERIOD
         way = (motion.goal - start) * (1.0, 1.0, 0.0)
         ahead = way / np.linalg.norm(way)
         low = to_paper(self.behind(start, way, CLEARANCE))
@@ -142,7 +142,7 @@ class Push(Task):
             # The lip pushes at a small angle, which corrects the sideways error of the block.
             across = left - remaining * ahead
             tilt = SIDEWAYS / max(SIDEWAYS, float(np.linalg.norm(across)) / remaining)
-            step = min(PACE, remaining) * ahead
+            step = min(pace, remaining) * ahead
             aims = (remaining * ahead + tilt * across, way)
             points = [to_paper(self.behind(place, aim, 0.0) + step) for aim in aims]
             safe = self.machine.conditioning_at(points[0]) >= self.machine.safe_conditioning

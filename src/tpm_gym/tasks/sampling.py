@@ -69,7 +69,7 @@ def safe_points(
         The known and the drawn points, (r, 3) m each.
 
     Raises:
-        ConfigurationError: If no draw is safe and far enough.
+        ConfigurationError: If no draw is safe, far enough, and near the singularity if it has to.
     """
     names = [*known, *(name for name in regions if name not in known)]
     first, rows = len(known), np.arange(len(rngs))
@@ -81,8 +81,9 @@ def safe_points(
     boxes = np.array([(box.low, box.high) for part in parts for box in part]).reshape(-1, 2, 3)
     counts = np.array([len(part) for part in parts], dtype=np.int64)
     least, most = _limits(machine, near_singularity)
-    shares = np.empty((len(rngs), len(parts), _BATCH if near_singularity else _DRAWS, 4))
-    for _ in range(_ATTEMPTS):
+    size = _BATCH if near_singularity else _DRAWS
+    shares = np.empty((len(rngs), len(parts), size, 4))
+    for _ in range(_ATTEMPTS * _BATCH // size):
         # One call for each generator, because a call takes longer than the numbers.
         for row, own in zip(rows.tolist(), shares, strict=False):
             rngs[row].random(out=own)
@@ -92,6 +93,8 @@ def safe_points(
         rows = rows[~found]
         if not len(rows):
             return dict(zip(names, points.swapaxes(0, 1), strict=True))
+    if near_singularity:
+        raise _no_tempting(f"on {machine.name!r} these places are not near a singularity")
     valid = f"with points of conditioning {least} to {most}, {apart} m from {', '.join(names)}"
     raise ConfigurationError("goal_region", dict(regions), valid)
 
@@ -123,8 +126,14 @@ def safe_draw(
         if len(fits):
             point: FloatArray = points[fits[0]]
             return point
-    valid = f"'sampled' or another machine: {machine.name!r} has no such way"
-    raise ConfigurationError("goals", goals, valid)
+    if goals == "tempting":
+        raise _no_tempting(f"{machine.name!r} has no such way")
+    valid = f"one with a way on which the conditioning is {least} or more"
+    raise ConfigurationError("machine", machine.name, valid)
+
+
+def _no_tempting(reason: str) -> ConfigurationError:
+    return ConfigurationError("goals", "tempting", f"'sampled': {reason}")
 
 
 def _limits(machine: Machine, near_singularity: bool) -> tuple[float, float]:
@@ -172,8 +181,7 @@ def _tempting(
             apart = np.linalg.norm(first - last, axis=-1) >= APART
             if apart and (line_in_joints(machine, first, last) < machine.safe_conditioning).any():
                 return first, last
-    valid = f"'sampled': on {machine.name!r} no straight line in the joints nears the singularity"
-    raise ConfigurationError("goals", "tempting", valid)
+    raise _no_tempting(f"on {machine.name!r} no straight line in the joints nears the singularity")
 
 
 def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:
@@ -199,8 +207,7 @@ def at_threshold(
         found += [*_at_the_threshold(rng, machine, region)]
         if len(found) >= count:
             return np.array(found[:count])
-    valid = f"'sampled': on {machine.name!r} the goals are not near a singularity"
-    raise ConfigurationError("goals", "tempting", valid)
+    raise _no_tempting(f"on {machine.name!r} the goals are not near a singularity")
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, is_number, is_whole
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, is_number, is_whole, numbers
 from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, UnreachableError
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.cup import CUP
@@ -333,7 +333,9 @@ class Task(ABC):
         chosen: dict[str, FloatArray] = {}
         for name, value in options.items():
             if belt is not None and name == "belt_speed":
-                chosen[name] = belt.require(np.reshape(value, -1), 1, ResetOptionError)
+                chosen[name] = belt.require(
+                    numbers("belt_speed", value, ResetOptionError).reshape(-1), 1, ResetOptionError
+                )
                 continue
             if name not in known:
                 raise ResetOptionError(str(name), value, valid)
@@ -507,9 +509,9 @@ class Task(ABC):
         """Invert :meth:`observe`: name -> (..., k) in SI units.
 
         Raises:
-            InputError: If the observation has another length, as in pixel observations.
+            InputError: If it is no array of numbers of this length; pixel observations are shorter.
         """
-        vector = np.asarray(observation, dtype=np.float64)
+        vector = numbers("observation", observation)
         if vector.shape[-1:] != (self.observation_size,):
             valid = f"(..., {self.observation_size}), as with observations='state'"
             raise InputError("observation", vector.shape, valid)

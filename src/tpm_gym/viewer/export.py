@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism import Machine
 from tpm_gym.viewer import server
-from tpm_gym.viewer.kinds import find_kind
+from tpm_gym.viewer.kinds import Kind, find_kind
 from tpm_gym.viewer.player import Player
 from tpm_gym.viewer.scene import RobotScene, set_camera
+
+if TYPE_CHECKING:
+    from viser import ViserServer
 
 _ENV: Final = "TPMPickAndPlace-v0"
 _HOLD: Final = 0.8
@@ -20,7 +23,7 @@ _OURS: Final = "__VISER_EMBED_DATA__="
 """Text of a page that viser wrote."""
 
 
-def export(folder: Path, machine: str | Machine = "paper", seed: int = 2) -> Path:
+def export(folder: str | Path, machine: str | Machine = "paper", seed: int = 2) -> Path:
     """Write ``index.html``: an episode of pick-and-place by the expert, in a loop.
 
     The page holds everything it needs. The engine is the analytic one.
@@ -34,37 +37,43 @@ def export(folder: Path, machine: str | Machine = "paper", seed: int = 2) -> Pat
         Path of the page.
 
     Raises:
-        ConfigurationError: If no machine has this name, the folder cannot be written, or it
-            has an ``index.html`` of another program.
+        ConfigurationError: If no machine has this name, the machine cannot do the task, the folder
+            cannot be written, or it has an ``index.html`` of another program.
     """
     kind = find_kind(machine)
-    found = kind.machine
-    page = _page(folder)
-    running = server.start("127.0.0.1", 0)
-    player = Player(_ENV, "analytic", found, "expert")
+    player = Player(_ENV, "analytic", kind.machine, "expert")
     try:
-        set_camera(running, found)
-        robot = RobotScene(running.scene, found)
-        robot.set_objects(player.task.scene, player.task.tolerance)
-
-        def draw() -> None:
-            robot.draw(kind.of_state(player.state).places)
-            robot.draw_objects(player.state, player.markers)
-
-        player.reset(seed)
-        draw()
-        recording = running.get_scene_serializer()
-        recording.insert_sleep(_HOLD)
-        while not player.ended:
-            player.step()
-            draw()
-            recording.insert_sleep(player.task.control_period)
-        recording.insert_sleep(_HOLD)
-        page.write_text(recording.as_html(), encoding="utf-8", newline="\n")
+        page = _page(Path(folder))
+        running = server.start("127.0.0.1", 0)
+        try:
+            page.write_text(_recording(running, kind, player, seed), "utf-8", newline="\n")
+        finally:
+            server.stop(running)
     finally:
         player.close()
-        server.stop(running)
     return page
+
+
+def _recording(running: ViserServer, kind: Kind, player: Player, seed: int) -> str:
+    """Return the page of an episode."""
+    set_camera(running, kind.machine)
+    robot = RobotScene(running.scene, kind.machine)
+    robot.set_objects(player.task.scene, player.task.tolerance)
+
+    def draw() -> None:
+        robot.draw(kind.of_state(player.state).places)
+        robot.draw_objects(player.state, player.markers)
+
+    player.reset(seed)
+    draw()
+    recording = running.get_scene_serializer()
+    recording.insert_sleep(_HOLD)
+    while not player.ended:
+        player.step()
+        draw()
+        recording.insert_sleep(player.task.control_period)
+    recording.insert_sleep(_HOLD)
+    return recording.as_html()
 
 
 def _page(folder: Path) -> Path:

@@ -27,6 +27,8 @@ def start(host: str, port: int) -> ViserServer:
     """
     if not is_whole(port, 0) or port > 65535:
         raise ConfigurationError("port", port, "a whole number from 0 to 65535")
+    if not isinstance(host, str):
+        raise ConfigurationError("host", host, "an address of this computer")
     free = _free_port(host, port)
     with redirect_stdout(io.StringIO()):
         return ViserServer(host=host, port=free, label="tpm_gym", verbose=False)
@@ -52,7 +54,7 @@ def _bound(host: str, port: int) -> int | None:
         family = socket.getaddrinfo(host, port)[0][0]
         with socket.create_server((host, port), family=family) as found:
             return int(found.getsockname()[1])
-    except OSError as error:
-        if error.errno in _TAKEN:
+    except (OSError, UnicodeError) as error:
+        if isinstance(error, OSError) and error.errno in _TAKEN:
             return None
         raise ConfigurationError("host", host, f"an address of this computer ({error})") from error

@@ -35,7 +35,12 @@ from tpm_gym.mechanism.delta.equations import (
     resolve,
     velocity,
 )
-from tpm_gym.mechanism.delta.geometry import IRB_360, DeltaGeometry
+from tpm_gym.mechanism.delta.geometry import (
+    IRB_360,
+    DeltaGeometry,
+    require_delta,
+    require_side,
+)
 from tpm_gym.mechanism.delta.kinematics import no_assembly
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
 from tpm_gym.mechanism.inertia import Swing, swing_force
@@ -210,6 +215,12 @@ class DeltaDynamics(EquationOfMotion):
     side: float = 1.0
 
     _formulas: ClassVar = Formulas(build, inertia_of, torques, masses, velocity, potential)
+
+    def __post_init__(self) -> None:
+        """Reject lengths and modes of other mechanisms."""
+        super().__post_init__()
+        require_delta(self.geometry)
+        require_side(self.side)
 
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
         pose, real = pose_at(theta, self.side, self.geometry, ns)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from tpm_gym.arrays import is_number
-from tpm_gym.errors import GeometryError
+from tpm_gym.arrays import is_number, vector
+from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import Numbers
 
@@ -67,6 +67,31 @@ WORKING_MODES: Final[tuple[Triple, ...]] = tuple(
 ELBOWS_OUT: Final[Triple] = (1.0, 1.0, 1.0)
 ASSEMBLY_MODES: Final = (-1.0, 1.0)
 """Two assembly modes: the sign of det A, the volume of the rods; 1 if P is below the elbows."""
+
+
+def require_delta(geometry: object) -> None:
+    """Raise InputError if the argument holds no lengths of a Delta, such as those of a TPM."""
+    if not isinstance(geometry, AnyDelta):
+        raise InputError("geometry", geometry, "a DeltaGeometry")
+
+
+def require_bends(bends: object) -> Triple:
+    """Return three signs as a member of WORKING_MODES.
+
+    Raises:
+        InputError: If they are no signs, 1 or -1.
+    """
+    one, two, three = vector("bends", bends)  # type: ignore[arg-type]
+    if (one, two, three) not in WORKING_MODES:
+        raise InputError("bends", bends, "three signs, each 1 or -1")
+    return one, two, three
+
+
+def require_side(side: object) -> None:
+    """Raise InputError if the argument is no member of ASSEMBLY_MODES."""
+    if not is_number(side) or side not in ASSEMBLY_MODES:
+        raise InputError("side", side, "1 or -1, the sign of det A")
+
 
 IRB_360 = DeltaGeometry(l1=0.164, l2=0.044, l3=0.524, l4=1.244, l5=0.050)
 """ABB's FlexPicker IRB 360-1/1600, with the lengths that R. L. Williams II gives in "The Delta

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite_points
 from tpm_gym.errors import SingularityError, UnreachableError
-from tpm_gym.kinematics.equations import Triple, leg_margin
+from tpm_gym.kinematics.equations import LEAST, Triple, leg_margin
 from tpm_gym.kinematics.equations import arms as arms_at
 from tpm_gym.kinematics.equations import conditioning as conditioning_of
 from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, by_rows
@@ -36,6 +36,9 @@ from tpm_gym.mechanism.delta.geometry import (
     WORKING_MODES,
     AnyDelta,
     DeltaGeometry,
+    require_bends,
+    require_delta,
+    require_side,
 )
 
 
@@ -55,6 +58,7 @@ class Factors(NamedTuple):
 
 def forward_all(theta: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray:
     """Compute P (..., 2, 3) m in both assembly modes, in the order of ASSEMBLY_MODES."""
+    require_delta(geometry)
 
     def text(angles: Triple, ns: Namespace) -> list[Numbers]:
         cos, sin = arms_at(angles, geometry, ns)
@@ -66,6 +70,7 @@ def forward_all(theta: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray:
 
 def inverse_all(position: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray:
     """Compute theta (..., 8, 3) rad in (-pi, pi], in the order of WORKING_MODES."""
+    require_delta(geometry)
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
         found = [posture_at(point, bends, geometry, ns) for bends in WORKING_MODES]
@@ -76,17 +81,21 @@ def inverse_all(position: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray
 
 def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> FloatArray:
     """Compute J (..., 3, 3) m/rad, v = J theta', in the assembly mode of this sign of det A."""
+    require_delta(geometry)
+    require_side(side)
 
     def text(angles: Triple, ns: Namespace) -> list[Numbers]:
         pose, real = pose_at(angles, side, geometry, ns)
         real = real & regular(pose, geometry)
-        return [tuple(_or_nan(real, row, ns) for row in velocity(pose))]
+        return [tuple(_or_nan(real, row, ns) for row in velocity(_regular(pose, real, ns)))]
 
     return by_rows(text, finite_points("theta", theta))[0]
 
 
 def factors(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> Factors:
     """Compute the factors that are zero at singularities, without a unit."""
+    require_delta(geometry)
+    require_side(side)
 
     def text(angles: Triple, ns: Namespace) -> list[Numbers]:
         return _factors(*pose_at(angles, side, geometry, ns), geometry, ns)
@@ -98,9 +107,11 @@ def factors_at(
     position: ArrayLike, bends: Triple = ELBOWS_OUT, geometry: AnyDelta = IRB_360
 ) -> Factors:
     """Compute the factors of :func:`factors` at points (..., 3) m in a working mode."""
+    require_delta(geometry)
+    modes = require_bends(bends)
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
-        return _factors(*_pose_at(point, bends, geometry, ns), geometry, ns)
+        return _factors(*_pose_at(point, modes, geometry, ns), geometry, ns)
 
     return Factors(*by_rows(text, finite_points("position", position)))
 
@@ -121,10 +132,14 @@ def conditioning_at(
     position: ArrayLike, bends: Triple = ELBOWS_OUT, geometry: AnyDelta = IRB_360
 ) -> FloatArray:
     """Compute 1/cond(J) (...,) at points (..., 3) m in a working mode; NaN out of reach."""
+    require_delta(geometry)
+    modes = require_bends(bends)
 
     def text(point: Triple, ns: Namespace) -> list[Numbers]:
-        pose, real = _pose_at(point, bends, geometry, ns)
-        return list(_or_nan(real, (conditioning_of(velocity(pose), ns),), ns))
+        pose, real = _pose_at(point, modes, geometry, ns)
+        exists = abs(pose.parallel) > LEAST
+        found = conditioning_of(velocity(_regular(pose, exists, ns)), ns)
+        return list(_or_nan(real, (ns.where(exists, found, 0.0),), ns))
 
     return by_rows(text, finite_points("position", position))[0]
 
@@ -133,7 +148,7 @@ def reachable(
     position: ArrayLike, bends: Triple = ELBOWS_OUT, geometry: AnyDelta = IRB_360
 ) -> BoolArray:
     """Return whether points (..., 3) m have a posture in a working mode, as (...,)."""
-    slot = WORKING_MODES.index(bends)
+    slot = WORKING_MODES.index(require_bends(bends))
     return inverse_all(position, geometry)[..., slot, 0] < 4.0
 
 
@@ -161,6 +176,11 @@ def no_assembly(
     if not regular(pose, geometry):
         return SingularityError("det A (the rods are coplanar)", float(pose.parallel))
     return UnreachableError(theta, "working mode", 0.0, "choose joint angles of the working mode")
+
+
+def _regular(pose: Pose, regular: Numbers, ns: Namespace) -> Pose:
+    """Replace det A where J does not exist, or the derivatives by the lengths would be NaN."""
+    return pose._replace(parallel=ns.where(regular, pose.parallel, 1.0))
 
 
 def _or_nan(real: Numbers, values: tuple[Numbers, ...], ns: Namespace) -> tuple[Numbers, ...]:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, first_row
+from tpm_gym.arrays import FloatArray, Vector, first_row, is_number, vector
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import NUMPY
@@ -50,9 +50,11 @@ class Delta(CompiledMachine):
         """See :class:`Machine`."""
         if not isinstance(self.geometry, DeltaGeometry):
             raise ConfigurationError("geometry", self.geometry, "a DeltaGeometry")
-        if self.working_mode not in WORKING_MODES:
+        signs = vector("working_mode", self.working_mode, ConfigurationError)
+        if signs not in WORKING_MODES:
             raise ConfigurationError("working_mode", self.working_mode, "three signs, 1 or -1")
-        if self.assembly_mode not in ASSEMBLY_MODES:
+        object.__setattr__(self, "working_mode", signs)
+        if not is_number(self.assembly_mode) or self.assembly_mode not in ASSEMBLY_MODES:
             raise ConfigurationError("assembly_mode", self.assembly_mode, "1 or -1")
         super().__post_init__()
 
@@ -88,12 +90,13 @@ class Delta(CompiledMachine):
 
     def joint_positions(self, theta: Vector) -> dict[str, float]:
         """See :class:`Machine`."""
+        angles = vector("theta", theta)
         pose, real = equations.pose_at(
-            tuple(map(np.float64, theta)), self.assembly_mode, self.geometry, NUMPY
+            tuple(map(np.float64, angles)), self.assembly_mode, self.geometry, NUMPY
         )
         if not real:
-            raise self.unassembled(theta)
-        return bodies.joint_positions(pose, theta, self.geometry.l4)
+            raise self.unassembled(angles)
+        return bodies.joint_positions(pose, angles, self.geometry.l4)
 
     @cached_property
     def dynamics(self) -> DeltaDynamics:

@@ -175,7 +175,7 @@ def joint_angles(
         InputError: If theta (3,) rad has the wrong shape or is not finite.
         UnreachableError: If the branch does not exist at theta.
     """
-    angles = joint_arrays(theta, branch, geometry)
+    angles = joint_arrays(vector("theta", theta), branch, geometry)
     return {name: float(angle) for name, angle in angles.items()}
 
 

@@ -27,10 +27,11 @@ from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 from tpm_gym.arrays import Vector
-from tpm_gym.errors import SingularityError, UnreachableError
+from tpm_gym.errors import InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics import DEFAULT_ASSEMBLY, AssemblyMode, equations, jacobian
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.geometry import PAPER, AnyLengths, Geometry
+from tpm_gym.kinematics.modes import require_mode
 from tpm_gym.kinematics.namespaces import Namespace, Numbers
 from tpm_gym.mechanism.equation_of_motion import Energy as Energy
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
@@ -247,6 +248,13 @@ class Dynamics(EquationOfMotion):
     branch: AssemblyMode = DEFAULT_ASSEMBLY
 
     _formulas: ClassVar = Formulas(build, inertia_of, torques, masses, velocity, potential)
+
+    def __post_init__(self) -> None:
+        """Reject lengths and modes of other mechanisms."""
+        super().__post_init__()
+        if not isinstance(self.geometry, AnyLengths):
+            raise InputError("geometry", self.geometry, "a tpm_gym.Geometry")
+        require_mode(self.branch, AssemblyMode)
 
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Pose, Numbers, Numbers]:
         pose, real = pose_at(theta, self.branch.signs, self.geometry, ns)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, numbers, points
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics import jacobian, workspace
 from tpm_gym.kinematics.equations import no_posture
@@ -51,11 +51,16 @@ class TPM(CompiledMachine):
         """See :class:`Machine`."""
         if not isinstance(self.geometry, Geometry):
             raise ConfigurationError("geometry", self.geometry, "a tpm_gym.Geometry")
+        for name, kind in (("working_mode", WorkingMode), ("assembly_mode", AssemblyMode)):
+            if not isinstance(getattr(self, name), kind):
+                valid = f"a tpm_gym.kinematics.{kind.__name__}"
+                raise ConfigurationError(name, getattr(self, name), valid)
         super().__post_init__()
 
     def same_side(self, position: ArrayLike) -> BoolArray:
         """See :class:`Machine`."""
-        return np.asarray(position)[..., 1] * self.assembly_mode.sin_beta > 0
+        array = points("position", numbers("position", position))
+        return array[..., 1] * self.assembly_mode.sin_beta > 0
 
     def unreachable(self, position: Vector) -> UnreachableError:
         """See :class:`Machine`."""

@@ -71,7 +71,9 @@ class Pictures:
             drawn = [geom for geom in scene.geoms[: scene.ngeom] if geom.segid >= 0]
             table = np.full(scene.ngeom + 1, BACKGROUND, dtype=np.int32)
             table[[geom.segid + 1 for geom in drawn]] = ids[[geom.objid for geom in drawn]]
-            segmentation = table[_draw(scene, context, view)[0] @ (1, 1 << 8, 1 << 16)]
+            # Edges of this depth are those of the ids; in smooth pictures they are not.
+            shown, share = _draw(scene, context, view)
+            segmentation = table[shown @ (1, 1 << 8, 1 << 16)]
         return Picture(colour, metres(share), segmentation)
 
     def close(self) -> None:
