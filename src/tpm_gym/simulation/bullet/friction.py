@@ -187,8 +187,7 @@ class Friction:
                 if math.hypot(u, v) > _FAST:  # a strike may make the object slip in any direction
                     self._set(table, _UNKNOWN)
                     self._set(self._cup, _BOX)
-            # with all other bodies
-            elif points := pybullet.getContactPoints(body, -1, -2, -2, self._number):
+            elif points := pybullet.getContactPoints(body, -1, -2, -2, self._number):  # with all
                 self._scale_at(index, points, index == held)
 
     def _scale_at(self, index: int, points: Sequence[Any], held: bool) -> None:
@@ -247,10 +246,11 @@ class Friction:
         slips = [_slip(motion, other, point) for point in points]
         if face is not None:
             self._set(face, _scales(slips, points, coefficient))
-        # Rigid, the forces on a held object are not determined, so that N has no meaning there.
-        if motion.body == self._held or max(slip[3] for slip in slips) <= _FAST:
+        pair = motion.body, other.body
+        # Forces on a held object are not determined, since all is rigid: N has no meaning there.
+        if self._held in pair or max(slip[3] for slip in slips) <= _FAST:
             return
-        pair, lack = (motion.body, other.body), _lack(motion, slips, points, coefficient)
+        lack = _lack(motion, slips, points, coefficient)
         self._lacks[pair] = lack
         if pair in self._lacked:
             x, y, z, p, q, r = map(_smaller, self._lacked[pair], lack)
