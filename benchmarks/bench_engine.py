@@ -245,8 +245,9 @@ def evaluation() -> float:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = shared.make_parser("Speed and accuracy of the analytic engine.")
-    parser.add_argument("--quick", action="store_true", help="a minute or two")
+    parser = shared.make_parser(
+        "Speed and accuracy of the analytic engine.", quick="a minute or two"
+    )
     parser.add_argument("--episodes", type=int, default=1000, help="of each row of success")
     parser.add_argument(
         "--part", choices=("speed", "threads", "torques", "success"), help="only this one"

@@ -127,8 +127,7 @@ def _place(cell: dict[str, Any]) -> tuple[Any, ...]:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = shared.make_parser("Compare engines and theory.")
-    parser.add_argument("--quick", action="store_true", help="some minutes")
+    parser = shared.make_parser("Compare engines and theory.", quick="some minutes")
     parser.add_argument("--jobs", type=int, default=1, help="processes for the matrix")
     parts = ("motions", "cost", "expert", *IDS)
     parser.add_argument("--renew", nargs="+", choices=parts, help="measure only these again")

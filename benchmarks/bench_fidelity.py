@@ -66,8 +66,7 @@ def publish() -> None:
 
 def main() -> None:
     """Parse the options and run."""
-    parser = shared.make_parser("Fidelity of the closed loops against cost.")
-    parser.add_argument("--quick", action="store_true", help="a minute")
+    parser = shared.make_parser("Fidelity of the closed loops against cost.", quick="a minute")
     parser.add_argument("--redraw", action="store_true", help="picture and page from the last run")
     parser.add_argument("--long", type=int, metavar="N", help="N time steps a motion, default only")
     options = parser.parse_args()

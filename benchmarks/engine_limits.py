@@ -98,7 +98,10 @@ def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--noises", type=float, nargs="+", default=NOISES)
     parser.add_argument("--episodes", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=1)
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    if options.write and options.policy != ENV_ID:
+        parser.error(f"--write is for the published policy, {ENV_ID}")
+    return options
 
 
 def main() -> None:

@@ -104,10 +104,16 @@ def open_files() -> int | None:
 # -- records and pages ----------------------------------------------------------------------------
 
 
-def make_parser(about: str) -> argparse.ArgumentParser:
-    """Return a parser with ``--write``, without which a benchmark only prints its results."""
+def make_parser(about: str, quick: str = "") -> argparse.ArgumentParser:
+    """Return a parser with ``--write``, without which a benchmark only prints its results.
+
+    With ``quick``, a help text, it has ``--quick`` too, which excludes ``--write``.
+    """
     parser = argparse.ArgumentParser(description=about)
-    parser.add_argument(_WRITE, action="store_true", help="replace the record and fill its page")
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(_WRITE, action="store_true", help="replace the record and fill its page")
+    if quick:
+        group.add_argument("--quick", action="store_true", help=f"{quick}; writes no files")
     return parser
 
 

@@ -135,15 +135,20 @@ def test_limits_leave_parts_of_sets_and_of_aspects():
 
 
 def test_the_figures_page_says_what_the_limits_leave():
+    """It has percentages of the elbows-out mode, and of its regions with z_C1 > z_B1."""
     text = " ".join((ROOT / "docs" / "figures.md").read_text(encoding="utf-8").split())
     said = re.search(r"stops leave (\d+)% of it.* and (\d+)% once no two links", text)
+    dark = re.search(r"leave (\d+)% of the largest, (\d+)% of the other dark region", text)
     assert said
+    assert dark
     left = []
     for aspect in aspects.aspects(shape=(64, 8, 96)):
         points = aspect.cells.centres()
         stops = within_stops(points, ELBOWS_OUT, PAPER)
         clear = clear_of_links(points[stops], ELBOWS_OUT, PAPER)
-        left.append((len(points), stops.sum(), clear.sum()))
-    whole, stops, clear = np.array(left).T
+        left.append((aspect.elevation, len(points), stops.sum(), clear.sum()))
+    elevation, whole, stops, clear = np.array(left).T
     both = [100 * part.sum() / whole.sum() for part in (stops, clear)]
     assert both == pytest.approx([float(n) for n in said.groups()], abs=1)
+    shares = (100 * stops / whole)[elevation > 0]
+    assert shares[[0, 2]] == pytest.approx([float(n) for n in dark.groups()], abs=1.5)

@@ -7,6 +7,7 @@ from typing import Any
 import bench_conveyor
 import bench_cycle
 import bench_shield
+import engine_limits
 import gymnasium as gym
 import pytest
 import shared
@@ -172,3 +173,16 @@ SCRIPTS = [
 def test_a_target_of_make_gives_write(script):
     assert "make_parser(" in (ROOT / "benchmarks" / script).read_text(encoding="utf-8")
     assert re.search(rf"{script}.* --write\n", (ROOT / "Makefile").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize(
+    "refuse",
+    [
+        lambda: shared.make_parser("", quick="a minute").parse_args(["--quick", "--write"]),
+        lambda: engine_limits.parse(["--policy", "other", "--write"]),
+    ],
+)
+def test_records_are_replaced_neither_by_quick_runs_nor_by_other_policies(refuse, capsys):
+    with pytest.raises(SystemExit):
+        refuse()
+    assert "--write" in capsys.readouterr().err
