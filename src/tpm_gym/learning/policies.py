@@ -81,8 +81,8 @@ class NoisyPolicy:
     rngs: list[np.random.Generator] = field(default_factory=list)
 
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
-        """Reset the policy, and seed a generator for each episode with the episode's seed."""
-        self.rngs = [np.random.default_rng(seed) for seed in seeds]
+        """Reset the policy, and seed a generator for each episode, as :class:`RandomPolicy`."""
+        self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
         self.policy.reset(observation, seeds)
 
     def act(self, observation: Observation) -> Action:

@@ -142,7 +142,7 @@ class Player:
     def reset(self, seed: int) -> None:
         """Begin the episode of a seed."""
         self._observation, _ = self._env.reset(seed=seed)
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng([seed, 1])  # the environment's own is default_rng(seed)
         self.records, self.ended = [], False
 
     def step(self) -> Record:
