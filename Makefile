@@ -93,7 +93,7 @@ bench-learning: $(INSTALLED) ## train and test all ids with five seeds, as far a
 	$(RUN) -m benchmarks.studies collect --runs runs/benchmark
 	$(MAKE) results
 
-bench-cloning: $(INSTALLED) ## behaviour cloning from 10, 50 and 400 episodes; see docs/datasets.md; an hour
+bench-cloning: $(INSTALLED) ## behaviour cloning from 10, 50 and 400 episodes; see docs/datasets.md; minutes
 	$(RUN) benchmarks/bench_cloning.py --write
 
 bench-kinematics: $(INSTALLED) ## speed of the kinematics against a floor and a general solver
@@ -122,7 +122,7 @@ bench-long: $(INSTALLED) ## loop gaps and FK error over a million time steps a m
 bench-limits: $(INSTALLED) ## success in each engine at two time steps; see docs/analytic-engine.md; minutes
 	$(RUN) benchmarks/engine_limits.py --jobs 2 --write
 
-bench-transfer: $(INSTALLED) ## policies trained in one engine (the runs in runs/transfer), tested in all
+bench-transfer: $(INSTALLED) ## policies trained in one engine, tested in all; see docs/transfer.md; an hour
 	$(RUN) benchmarks/bench_transfer.py --jobs 2 --write
 
 bench-first: $(INSTALLED) ## from the start of Python to the first step, with and without compiled code on disk

@@ -1,12 +1,12 @@
 """Test policies of one engine in all engines and with all drives.
 
-    tpm-gym train --algo ppo --engine analytic --env TPMPickAndPlaceDense-v0 --seed 0   # and so on
     make bench-transfer
-    python benchmarks/bench_transfer.py --runs runs --episodes 200 --jobs 2
+    python benchmarks/bench_transfer.py --runs runs/own --train 0 --jobs 2
 
-The best policy of each run in ``--runs`` and the published policies are tested in each engine, with
-ideal and servo drives. Include runs of few steps (``--steps``), whose policies drop the block, and
-of ``shoving.py``, because errors of contact would show in both.
+``--train N`` first trains each of ``TRAININGS`` with N seeds, except the runs that are there. The
+best policy of each run in ``--runs`` and the published policies are tested in each engine, with
+ideal and servo drives. Policies of few steps drop the block, and those of Push strike it, so that
+errors of contact would show.
 
 With ``--write``, results go to docs/records/transfer.json, and from there to docs/transfer.md.
 """
@@ -14,13 +14,16 @@ With ``--write``, results go to docs/records/transfer.json, and from there to do
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from engine_matrix import DRIVES
@@ -30,11 +33,25 @@ from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.learning.run_folder import is_finished
 
 RECORD = ROOT / "docs" / "records" / "transfer.json"
 PAGE = ROOT / "docs" / "transfer.md"
 ENGINES = ("analytic", "pybullet", "mujoco")
 PUBLISHED = ("TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0")
+TRAININGS: Final = (
+    ("TPMReachDense-v0", "pybullet", "ideal", None),
+    ("TPMReachDense-v0", "analytic", "ideal", None),
+    ("TPMPickAndPlaceDense-v0", "analytic", "ideal", None),
+    ("TPMPickAndPlaceDense-v0", "analytic", "ideal", 200_000),
+    ("TPMPickAndPlaceDense-v0", "analytic", "servo", None),
+    ("TPMPickAndPlaceJointsDense-v0", "analytic", "ideal", None),
+    ("TPMPickAndPlaceJointsDense-v0", "analytic", "ideal", 300_000),
+    ("TPMPickAndPlaceJointsDense-v0", "analytic", "servo", None),
+    ("TPMConveyorDense-v0", "analytic", "ideal", None),
+    ("TPMPushDense-v0", "analytic", "ideal", None),
+)
+"""Id, engine, drive and steps of trainings with PPO; None for the steps of the recipe."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +68,26 @@ class Cell:
     engine: str
     drive: str
     episodes: int
+
+
+def commands(runs: Path, seeds: int) -> Iterator[list[str]]:
+    """Yield the commands of the trainings that are left."""
+    for (env_id, engine, drive, steps), seed in product(TRAININGS, range(seeds)):
+        folder = runs / f"{env_id}-{engine}-{drive}-{steps or 'all'}-s{seed}"
+        if is_finished(folder):
+            continue
+        options = {"env": env_id, "engine": engine, "drive": drive, "algo": "ppo", "seed": seed}
+        options |= {"run": folder, "test-episodes": 0} | ({"steps": steps} if steps else {})
+        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
+        yield [sys.executable, "-m", "tpm_gym.learning", "train", *words, "--overwrite"]
+
+
+def train_all(runs: Path, seeds: int, jobs: int) -> None:
+    """Train what is left, several runs at a time."""
+    with ThreadPoolExecutor(jobs) as pool:
+        run_quietly = partial(subprocess.run, check=True, stdout=subprocess.DEVNULL)
+        for done in pool.map(run_quietly, commands(runs, seeds)):
+            print(*done.args[4:], file=sys.stderr)
 
 
 def cells(runs: Path, episodes: int, drives: Sequence[str]) -> Iterator[Cell]:
@@ -122,10 +159,12 @@ def main() -> None:
     """Parse the options and run."""
     parser = make_parser("Test policies in all engines.")
     parser.add_argument("--runs", type=Path, default=ROOT / "runs" / "transfer")
+    parser.add_argument("--train", type=int, default=5, metavar="N", help="seeds to train")
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--drives", nargs="+", choices=DRIVES, default=DRIVES)
     parser.add_argument("--jobs", type=int, default=1)
     options = parser.parse_args()
+    train_all(options.runs, options.train, options.jobs)
     todo = list(cells(options.runs, options.episodes, options.drives))
     found = []
     with ProcessPoolExecutor(options.jobs) as pool:

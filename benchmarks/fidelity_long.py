@@ -51,13 +51,11 @@ class Histogram:
 
     @property
     def mean(self) -> float:
-        """Mean of all samples; NaN without samples."""
-        return self._sum / self.count if self.count else float("nan")
+        """Mean of all samples."""
+        return self._sum / self.count
 
     def quantile(self, share: float) -> float:
         """Return the upper edge of the bin of a quantile, or the maximum if it is smaller."""
-        if not self.count:
-            return float("nan")
         at = int(np.searchsorted(np.cumsum(self._counts), share * self.count))
         edge = 10 ** (self.LOW + (at + 1) / self.BINS * (self.HIGH - self.LOW))
         return min(edge, self.maximum)
@@ -108,7 +106,8 @@ class Probe:
         """Return mean, 99.9 % quantile and maximum of each quantity, in SI units."""
         named = {"gap": self.gap, "fk": self.fk, "fk_near": self.fk_near, "tilt": self.tilt}
         found: dict[str, Any] = {
-            name: {"samples": h.count, "mean": h.mean, "p999": h.quantile(0.999), "max": h.maximum}
+            name: {"samples": h.count, "max": h.maximum}
+            | ({"mean": h.mean, "p999": h.quantile(0.999)} if h.count else {})
             for name, h in named.items()
         }
         return found | {"steps": self.steps, "share_gap_below_0.1_mm": self.below / self.steps}

@@ -2,6 +2,7 @@
 
 import inspect
 import itertools
+import math
 import re
 from collections.abc import Iterator
 from contextlib import closing
@@ -166,6 +167,23 @@ def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit():
         env = TPMEnv("pick_and_place", randomisation=option)
         prints.add(fingerprint(random_episode(env, 0, 25)) + fingerprint(random_episode(env, 1, 5)))
     assert len(prints) == 1
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"link_masses": (1.0, -1.0)},
+        {"block_mass": math.nan},
+        {"friction": "rough"},
+        {"motor_strength": (1.0, 1.0)},
+        {"joint_friction": 0.5},
+        {"encoder_bias": (0.0, math.inf, 0.0)},
+    ],
+)
+def test_a_plant_that_no_robot_can_have_is_refused(wrong):
+    (name,) = wrong
+    with pytest.raises(ConfigurationError, match=name):
+        Plant(**wrong)
 
 
 # -- masses ----------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ nominal machine, as on a real robot.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -38,6 +39,9 @@ LIMITS: dict[str, Range] = {
 }
 """Smallest and largest value of each attribute of :class:`Randomisation`."""
 
+_SIGNED = ("encoder_bias", "length_errors")
+_OF_MOTORS = ("motor_strength", "servo_stiffness", "joint_friction", "encoder_bias")
+
 
 @dataclass(frozen=True)
 class Plant:
@@ -53,6 +57,10 @@ class Plant:
         joint_friction: Coulomb friction on the axis of each motor, N m.
         encoder_bias: Encoder reading minus true joint position of each motor, rad.
         length_errors: True minus nominal lengths (l1 to l7), m; empty if all errors are zero.
+
+    Raises:
+        ConfigurationError: If a value is not finite, a factor or the friction is negative, or
+            there are not three values for three motors.
     """
 
     link_masses: tuple[float, ...] = ()
@@ -63,6 +71,17 @@ class Plant:
     joint_friction: Vector = (0.0, 0.0, 0.0)
     encoder_bias: Vector = (0.0, 0.0, 0.0)
     length_errors: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for name, value in vars(self).items():
+            numbers = value if isinstance(value, tuple) else (value,)
+            least = -math.inf if name in _SIGNED else 0.0
+            sized = name not in _OF_MOTORS or len(numbers) == 3
+            if not sized or not all(is_number(number) and number >= least for number in numbers):
+                count = "three " if name in _OF_MOTORS else ""
+                zero = "" if name in _SIGNED else ", 0 or more"
+                raise ConfigurationError(name, value, f"{count}finite numbers{zero}")
 
     def lengths_of(self, nominal: Machine) -> tuple[float, ...]:
         """Return the true lengths, m; empty if all lengths are nominal."""

@@ -1,6 +1,10 @@
 """What MuJoCo alone does: its own frames, its console, its missing package."""
 
+from contextlib import nullcontext
+from types import SimpleNamespace
+
 import gymnasium as gym
+import mujoco
 import numpy as np
 import pytest
 from alone import Alone
@@ -55,6 +59,28 @@ def test_a_mechanism_torn_apart_is_a_typed_error_and_nothing_else(
         written = [name for name in written if name != "MUJOCO_LOG.TXT"]
     assert not printed
     assert not written
+
+
+def test_a_closed_window_stays_closed_when_lengths_change(monkeypatch):
+    opened = []
+
+    def launch(model, data, **panels):
+        opened.append(SimpleNamespace(
+            is_running=lambda: False, close=lambda: None, sync=lambda: None,
+            opt=SimpleNamespace(sitegroup=np.ones(6)), cam=mujoco.MjvCamera(),
+            lock=nullcontext, user_scn=SimpleNamespace(geoms=[], ngeom=0),
+        ))  # fmt: skip
+        return opened[-1]
+
+    for module in ("simulation.mujoco.window", "envs.single"):
+        monkeypatch.setattr(f"tpm_gym.{module}.has_display", lambda: True)
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch)
+    options = {"randomisation": {"length_error": 1e-3}, "render_mode": "human"}
+    env = gym.make("TPMReach-v0", engine="mujoco", disable_env_checker=True, **options)
+    for seed in range(3):  # the user closes the first window, other lengths make other models
+        env.reset(seed=seed)
+    env.close()
+    assert len(opened) == 1
 
 
 def test_a_window_without_a_display_is_refused_by_name(monkeypatch):

@@ -18,7 +18,7 @@ from tpm_gym.simulation.stage import MARKER_COLOUR
 class Window:
     """Viewer that opens at the first call of :meth:`show`, and for each new model.
 
-    After the user has closed it, it stays closed until the model changes.
+    After the user has closed it, it stays closed.
 
     Raises:
         ConfigurationError: If no window can open.
@@ -42,11 +42,11 @@ class Window:
         radius: float,
     ) -> None:
         """Draw the scene with goal markers (k, 3) m as spheres of ``radius`` (m)."""
+        if self._viewer is not None and not self._viewer.is_running():
+            return
         if model is not self._model:  # the first model, or a robot with other lengths
             self._open(model, data, camera)
         viewer = self._viewer
-        if not viewer.is_running():
-            return
         with viewer.lock():
             if camera != self._aimed:  # else the user may move the camera
                 aim(viewer.cam, camera)
