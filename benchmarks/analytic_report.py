@@ -52,7 +52,8 @@ def _speed(rows: dict[str, Any]) -> Iterator[str]:
     )
     yield ""
     taken = _quartiles(rows["evaluation"], "{:.2f}")
-    yield f"1000 episodes of the published policy of {PICK}, records and all, take {taken} s."
+    policy = f"the published policy of {PICK}"
+    yield f"1000 episodes of {policy}, including their statistics, take {taken} s."
 
 
 def _engine(name: str) -> str:

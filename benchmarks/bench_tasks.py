@@ -116,8 +116,10 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
         ],
     )
     yield ""
-    how = "`make bench-tasks`; some cells by its function `measure`, with fewer episodes."
-    yield f"{processor_line(record['conditions'])}; {how}"
+    yield (
+        f"{processor_line(record['conditions'])}; `make bench-tasks`. Some cells were measured by "
+        "the function `measure` of `benchmarks/bench_tasks.py`, with fewer episodes."
+    )
 
 
 def _conditions(other: dict[str, str]) -> tuple[str, str]:

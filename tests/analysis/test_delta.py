@@ -215,7 +215,7 @@ def test_the_page_s_numbers_are_computed():
     assert rows["forward solutions"] == ["4", "2", "2"]
     printed = [[float(v) for v in cell.split(", ")] for cell in rows["motors that count, x, y, z"]]
     np.testing.assert_allclose(printed, counts, atol=0.05)
-    assert f'"motors that count" is {counts[2].mean():.2f} there' in TEXT
+    assert f'"motors that count" is {counts[2].mean():.2f} on average' in TEXT
 
 
 def test_the_page_s_code_runs():
