@@ -162,9 +162,10 @@ def stamp(function: Callable[..., Any]) -> str:
 
 
 def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield text about a value that is equal in all processes if code and constants are equal.
+    """Yield text about a value.
 
-    The order counts, because the same parts in another order make another function.
+    The text is equal in all processes in which code and constants are equal. The order counts,
+    because the same parts in another order make another function.
     """
     value = getattr(value, "py_func", value)
     if isinstance(value, tuple):

@@ -90,7 +90,7 @@ class UnreachableError(TPMError, ValueError):
     hint: str
 
     def __post_init__(self) -> None:
-        """Convert to plain floats."""
+        """Convert the numbers to plain floats."""
         self.point = tuple(float(value) for value in self.point)
         self.margin = float(self.margin)
 
@@ -177,7 +177,7 @@ class PolicyFileError(TPMError, ValueError):
 
 @dataclass(eq=False)
 class PolicyMismatchError(TPMError, ValueError):
-    """A policy does not fit an environment; it fits ``env_id``."""
+    """The policy does not fit the environment; it was trained in ``env_id``."""
 
     template: ClassVar[str] = (
         "the policy was trained with {kind} {trained}, the environment has {given}; use it in "

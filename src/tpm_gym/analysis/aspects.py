@@ -1,10 +1,11 @@
 """The reachable set of a working mode, and its aspects: maximal regions free of singularities.
 
-The platform can move between two points of one aspect (Wenger and Chablat) without a singularity,
-and not between two aspects of one working mode. Sets are grids of cells in the paper frame, in
-metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only curved surfaces run
-through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Other limits, such as
-the stops of the motors, count only if they are given (:mod:`tpm_gym.analysis.limits`).
+The platform can move between two points of one aspect without a singularity (Wenger and Chablat).
+Between two aspects of one working mode, every path passes a singularity. Sets are grids of cells in
+the paper frame, in metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only
+curved surfaces run through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Other
+limits, such as the stops of the motors, count only if they are given
+(:mod:`tpm_gym.analysis.limits`).
 """
 
 import math
@@ -30,7 +31,7 @@ _BITS = (1, 2, 4, 8)
 
 @dataclass(frozen=True)
 class Cells:
-    """Set of points, as the cells of a grid whose centres belong to the set.
+    """Set of points, as cells of a grid: those cells whose centres belong to the set.
 
     Attributes:
         low: Corner of the grid with the smallest x, y, z, m.
@@ -73,7 +74,7 @@ class Aspect:
         branch: Working mode: the signs of the serial factors.
         assembly: Assembly mode: the signs of sin(beta) and the planar factor.
         level3: Sign of the parallel factor l1 + l3 c3 - xC - 2 l2.
-        elevation: Sign of the constraint's factor, z_C1 - z_B1.
+        elevation: Sign of z_C1 - z_B1, which is zero at a constraint singularity.
     """
 
     branch: WorkingMode
@@ -169,8 +170,9 @@ def regions(
 def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     """Sample points (count, 3) m, uniform over an aspect, not only over its cells.
 
-    Parts of the aspect more than a cell away from its cells are missing, and another region with
-    the same signs less than a cell away is included. Elsewhere the boundary is exact.
+    Points are drawn in the aspect's cells and their neighbours, and kept if all factors have the
+    signs of the aspect. So a part of the aspect farther away is missing, and a part of another
+    region is included if it is so near and has the same signs. Elsewhere the boundary is exact.
 
     Raises:
         ConfigurationError: count is negative, or the aspect has no cells.
@@ -194,9 +196,9 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
 def largest_box(aspect: Aspect, threshold: float) -> Box:
     """Find the largest axis-aligned box in an aspect with 1/cond(J) >= threshold.
 
-    The nodes of the grid are the centres of cells. No larger box with nodes as corners has all its
-    nodes in the aspect and 1/cond(J) >= threshold at all of them. The conditioning between nodes is
-    not checked; it varies little from node to node.
+    The nodes of the grid are the centres of cells. The corners of a box are nodes, and all nodes in
+    the box are in the aspect and have 1/cond(J) >= threshold. The largest such box is returned. The
+    conditioning between nodes is not checked; it varies little from node to node.
 
     Raises:
         ConfigurationError: The threshold is not between 0 and 1, or no box of at least two nodes
@@ -294,8 +296,8 @@ def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
 
 
 def largest_block(mask: BoolArray) -> tuple[Shape, Shape] | None:
-    """Return the first and last node of the largest all-true block; None if none has a volume."""
-    # For each range of y and each width in x: the longest run along z of columns true over both.
+    """Return the first and last node of the largest all-true block with a volume, or None."""
+    # For each range of y and each width in x, find the longest run along z that is true over both.
     nx, ny, nz = mask.shape
     count = np.cumsum(np.pad(mask, ((0, 0), (1, 0), (0, 0))), axis=1)
     position = np.arange(nz)

@@ -1,7 +1,8 @@
 """Partial decoupling of the mechanism: which motor moves which coordinate.
 
-Let r_i = B_iC_i, leg_i and planar the factors of Eqs. (16) and (17), corrected, w_i the speed of
-motor i, and k = sin(beta) level3. The differentiated closures are
+Let r_i be the vector B_iC_i, w_i the speed of motor i, leg_i the factor of leg i in Eq. (17), and
+k = sin(beta) level3 the product of two factors in Eq. (16). Both equations are used as corrected in
+docs/paper.md. The derivatives of the closures by time are
 
     leg_1 w_1 = r_1x xC' + r_1z zC'
     leg_2 w_2 = r_2x xC' + r_2z zC'
@@ -29,9 +30,9 @@ PLATFORM = np.array([[True, True, True], [True, True, True], [True, True, False]
 """Entries of J that are not always zero: rows x, y, z of P, columns motors 1, 2, 3."""
 
 LINKS = np.array([[True, True, False], [True, True, False], [True, True, True]])
-"""Entries that are not always zero: rows xC, zC of link 3' and beta of link 7, columns motors.
+"""Entries of d(xC, zC, beta) / d(theta) that are not always zero; columns motors 1, 2, 3.
 
-The inverse matrix has the same entries.
+The inverse matrix has its zeros at the same places. xC and zC belong to link 3', beta to link 7.
 """
 
 

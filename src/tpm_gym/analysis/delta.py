@@ -33,8 +33,8 @@ def chains(
         theta: Joint positions.
         side: Assembly mode, the sign of det A.
         geometry: Lengths.
-        balls: Whether a leg is a motor and a parallelogram of balls, as those of this package, or
-            motor, R, parallelogram of revolutes, R.
+        balls: True for legs of a motor and a parallelogram of balls, as the package's Delta has.
+            False for legs of a motor, R, a parallelogram of revolutes, and R.
 
     Raises:
         InputError: If theta is not three finite numbers.

@@ -6,11 +6,11 @@ intersection the common subspace, separately for translations and rotations, as 
 [t; r] of the paper. A revolute joint with axis s through a point p contributes r(|| s). It also
 contributes t along s x (o' - p), unless the axis passes through the base point o' of the end link.
 
-Subspaces replace the paper's symbols for directions. Choose the base point so that no element is
-dependent; there is no notation for dependent elements (the paper has braces). The sets are exact
-for chains that translate and rotate independently, as all chains of this mechanism do. They
-describe one configuration. Dimensions can change at a singularity; elsewhere they are the full-
-cycle values of the paper.
+Subspaces replace the paper's symbols for directions. Choose the base point so that no element of a
+set depends on the others: the paper writes dependent elements in braces, and this module cannot
+mark them. The sets are exact for chains that translate and rotate independently, as all chains of
+this mechanism do. They describe one configuration. Dimensions can change at a singularity;
+elsewhere they are the full-cycle values of the paper.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
 
 
 def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
-    """Return a parallelogram of four revolutes, P^(4R), from the same arguments.
+    """Return a parallelogram of four revolutes, P^(4R); arguments as in :func:`parallelogram_4s`.
 
     It translates in its plane, across the rods. The paper writes t^1(|| R32), the direction of the
     short links; this is exact only if the rods are perpendicular to them.
@@ -200,13 +200,16 @@ def parallel(sets: Sequence[POCSet]) -> POCSet:
 
 
 def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ...]:
-    """Return kappa of each Assur kinematic chain (AKC), Eq. (5), from Delta_j by decomposition.
+    """Return the coupling degree kappa of each Assur kinematic chain (AKC), Eq. (5).
 
-    The decomposition with the smallest sum of |Delta_j| counts. An AKC ends where its constraint
-    degrees add up to zero.
+    An AKC ends where its constraint degrees add up to zero.
+
+    Args:
+        decompositions: Constraint degrees Delta_j of the loops, for each decomposition. The one
+            with the smallest sum of |Delta_j| is used.
 
     Raises:
-        InputError: The constraint degrees of the decomposition do not add up to zero.
+        InputError: The constraint degrees of this decomposition do not add up to zero.
     """
     best = min(decompositions, key=lambda deltas: sum(abs(delta) for delta in deltas), default=())
     found, run = [], list[int]()
@@ -268,7 +271,7 @@ class ParallelMechanism:
         return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
 
     def dof(self, loops: int | None = None) -> int:
-        """Return F = sum of f_i - sum of xi_Lj, Eq. (3a), for the first loops; default: all."""
+        """Return F = sum f_i - sum xi_Lj, Eq. (3a), of the first ``loops`` loops; None for all."""
         return sum(loop.freedoms - loop.equations for loop in self.loops[:loops])
 
 
@@ -297,7 +300,7 @@ def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loo
 
 
 def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
-    """Return the loops that form as the chains are mounted in order; two chains form the first."""
+    """Return the loops that form as chains are added in order; the first one has two chains."""
     chains, sets = zip(*order, strict=True)
     loops = []
     for j in range(1, len(order)):

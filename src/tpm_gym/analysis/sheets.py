@@ -22,7 +22,8 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
 
 Point = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""xC and zC, m, and p, q: the point belongs to the working mode if p + q cos(beta) > 0."""
+"""xC and zC in m, and two numbers p and q. The point belongs to the working mode if
+p + q cos(beta) > 0, and cos(beta) has the sign of the mode."""
 Curve = Callable[[Geometry, WorkingMode, FloatArray, FloatArray, FloatArray], Point]
 """Point of a curve, as a function of lengths, mode, angle, and two signs that name the branch."""
 
@@ -34,7 +35,7 @@ _BLOCK = 64  # points at a time
 
 
 def _level3(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Return points where rod 11 is parallel to link 7, seen along z: circles, seen along y."""
+    """Return points of the two circles on which rod 11, seen along z, is parallel to link 7."""
     cos, sin = np.cos(t), np.sin(t)
     rise = up * np.sqrt(max(g.l4**2 - g.l7**2, 0.0))
     x, z = g.l1 - 2 * g.l2 + g.l3 * cos, g.l3 * sin - g.l6 + rise
@@ -50,9 +51,12 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the triangle of the planar factor at theta_1, seen along y, with leg 2 moved to C1."""
-    # A2B1: level, upwards, and its length; and the coordinate of B1 from B2 along rod 4, below 0.
-    # side is -1 if rods 4 and 6 point in opposite directions.
+    """Return x, z and length of A2B1, and the coordinate of B2 from B1 along rod 6, below 0, m.
+
+    Everything is seen along y at theta_1 = ``t``, with leg 2 moved so that C2 is at C1. Where the
+    planar factor is zero, rods 4 and 6 lie on one line, so that A2, B1 and B2 form a triangle.
+    ``side`` is -1 if the rods point in opposite directions.
+    """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
     rod = side * np.sqrt(np.maximum(_rod_4(g, t)[1], 0.0))
     return level, up, np.hypot(level, up), rod - g.l4
@@ -61,7 +65,7 @@ def _tangent(
 def _planar(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, bend: FloatArray
 ) -> Point:
-    """Return points where rods 4 and 6 have equal directions and arm 2 reaches, over theta_1."""
+    """Return points at theta_1 = ``t`` where rods 4 and 6, seen along y, are parallel."""
     level, up, apart, gap = _tangent(g, t, side)
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (g.l3**2 - gap**2 - apart**2) / (2 * gap * apart)
@@ -74,13 +78,13 @@ def _planar(
 
 
 def _leg1(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Return points where leg 1 is stretched or folded, over the angle of the rods to arm 1."""
+    """Return points where leg 1 is stretched or folded; ``t`` is the angle from arm to rods."""
     square = (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     return g.l4 * np.sin(t), up * np.sqrt(np.maximum(square, 0.0)), 1.0 + 0 * t, 0.0 * t
 
 
 def _leg2(g: Geometry, mode: WorkingMode, t: FloatArray, far: FloatArray, _: FloatArray) -> Point:
-    """Return points where leg 2 is stretched or folded: circles about A2."""
+    """Return points where leg 2 is stretched or folded: circles about A2 + (2 l5, 0, 0)."""
     radius = np.abs(g.l4 + far * g.l3)
     x, z = radius * np.cos(t) + 2 * g.l5 - g.l1, radius * np.sin(t)
     return x, z, 1.0 + 0 * t, 0.0 * t
@@ -89,7 +93,7 @@ def _leg2(g: Geometry, mode: WorkingMode, t: FloatArray, far: FloatArray, _: Flo
 def _elevation(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, _: FloatArray
 ) -> Point:
-    """Return points where C1 is as high as B1, over theta_1."""
+    """Return points at theta_1 = ``t`` where C1 is as high as B1."""
     y, square = _rod_4(g, t)
     x, sin = side * np.sqrt(np.maximum(square, 0.0)), np.sin(t)
     return x, g.l3 * sin, mode.leg1 * y * sin, 0.0 * t
@@ -119,7 +123,7 @@ _CURVES: dict[str, Curve] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """Arcs of one factor, m in number: signs (m,), and intervals of the angle (m,), rad."""
+    """Arcs of one factor, n in number: signs (n,), and intervals of the angle (n,), rad."""
 
     curve: Curve
     geometry: Geometry
@@ -140,7 +144,7 @@ class _Arcs:
 
 @lru_cache(maxsize=64)
 def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Point, FloatArray]:
-    """Return arcs, points (m, cells + 1), and lengths of the curve between them, (m, cells) m."""
+    """Return n arcs, points (n, cells + 1), and curve lengths between these, (n, cells) m."""
     rows = [
         (first, second, (low + high) / 2, (high - low) / 2)
         for first in (-1, 1)
@@ -196,7 +200,10 @@ def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, fl
 def _zoom(
     function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return the minimum of a function of (n, nodes) between low and high (n,)."""
+    """Return where n functions are smallest, (n,), between ``low`` and ``high`` (n,).
+
+    ``function`` takes numbers (n, nodes), a row for each function, and returns the values.
+    """
     steps, rows = np.linspace(0, 1, _NODES), np.arange(len(low))
     found = low
     for _ in range(_ROUNDS):
@@ -211,7 +218,7 @@ def _zoom(
 def nearest(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, geometry: Geometry
 ) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Find the nearest point of all five surfaces on a working mode, nearer than a limit.
+    """Find the nearest point of the five surfaces within a limit, in one working mode.
 
     Args:
         points: (n, 3) m, 0 <= y <= l7.
@@ -221,8 +228,8 @@ def nearest(
         geometry: Link lengths.
 
     Returns:
-        Distance (n,) m, foot (n, 3) m and index of the factor (n,). Where nothing is nearer, these
-        are ``limit``, the point itself and -1.
+        Distance (n,) m, nearest point (n, 3) m and index of the factor (n,). Where no surface is
+        nearer than ``limit``, these are ``limit``, the point itself and -1.
     """
     distance, feet, factor = limit.copy(), points.copy(), np.full(len(points), -1)
     for start in range(0, len(points), _BLOCK):
@@ -240,12 +247,16 @@ def nearest(
 def _feet(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, g: Geometry, name: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the points that may be near a surface: their rows, distances from it, and feet."""
+    """Return candidates for the nearest points of a surface: rows of points, distances, feet."""
     arcs, (x, z, p, q), length = _arcs(g, mode, name)
     link3 = points - [g.l2, 0, 2 * g.l6]  # C1 for a link 7 of length 0
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the distance, and the level distance from C1 to P along x and in the plane xy."""
+        """Return the distances of ``rows`` to circles about (x, 0, z), and to these centres.
+
+        The circles have the radius l7 and are parallel to xy. Distances to the centres are measured
+        along x, and in the plane xy.
+        """
         level = rows[..., 0] - x
         radius = np.hypot(level, rows[..., 1])
         return np.hypot(radius - g.l7, rows[..., 2] - z), level, radius
@@ -255,7 +266,7 @@ def _feet(
         ours: BoolArray = (point[2] * radius + point[3] * level > 0) & (mode.cos_beta * level > 0)
         return ours
 
-    # Enter each cell that can hold a nearer point than the nearest so far, by its ends and length.
+    # Search each cell whose ends and length allow a point nearer than the nearest one so far.
     ends, level, radius = offset(link3[:, None, None], x, z)
     ours = belongs((x, z, p, q), level, radius)
     known = np.minimum(limit, np.where(ours, ends, np.inf).min(axis=(1, 2), initial=np.inf))
@@ -265,13 +276,13 @@ def _feet(
     low, all_ = cell.astype(np.float64) * step, np.arange(len(cell))
 
     def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
-        """Return points at t (k, ...) of cells (k,), offsets, and whether they belong here."""
+        """Return points at t (k, ...) of cells (k,), and what offset() and belongs() return."""
         point, rows = arcs.at(arc[cells], t), link3[row[cells]]
         found = offset(rows[:, None] if t.ndim > 1 else rows, *point[:2])
         return point, found, belongs(point, *found[1:])
 
     t = _zoom(lambda t: on(all_, t)[1][0], low, low + step)
-    # Where the nearest point of a cell is of another mode, find the nearest one of this mode.
+    # Where a cell's nearest point is in another mode, find its nearest point in this mode.
     either = ours[row, arc, cell] | ours[row, arc, cell + 1]
     split = np.flatnonzero(either & ~on(all_, t)[2])
 

@@ -5,9 +5,10 @@ det A and four serial factors make up det B (Eqs. 16 and 17, corrected). The eig
 elevation z_C1 - z_B1 of rods 4: where it is zero, nothing keeps link 3' from turning about y, a
 constraint singularity that the paper lacks. Everything is in the paper frame, in m and rad.
 
-All functions take arrays (..., 3) of numbers and raise InputError for anything else. The functions
-that classify raise InputError for entries that are not finite too, UnreachableError if a row does
-not exist on the branch, and ConfigurationError if the tolerance is not between 0 and 1.
+Functions of angles or points take arrays (..., 3) of numbers and raise InputError for anything
+else. The functions that classify also raise InputError for numbers that are not finite,
+UnreachableError if the branch does not exist at one of the angles or points, and ConfigurationError
+if the tolerance is not between 0 and 1.
 """
 
 from dataclasses import dataclass
@@ -55,7 +56,7 @@ class Classification:
 
     Attributes:
         kind: (...,) values of :class:`SingularityType`.
-        vanishing: (..., 8) bool, true for :data:`FACTORS` up to the ``tolerance``.
+        vanishing: (..., 8) bool, true where a factor's absolute value is at most ``tolerance``.
         factors: (..., 8), the factors from :func:`dimensionless`.
     """
 
@@ -67,13 +68,13 @@ class Classification:
 
 @dataclass(frozen=True)
 class NearestSingularity:
-    """Nearest singular position of each point; NaN where not valid, and -1 as its factor.
+    """Nearest singular position of each point, from :func:`nearest_singularity`.
 
     Attributes:
-        distance: (...,) m.
-        point: (..., 3) m, singular position of P at this distance.
-        factor: (...,) index in :data:`FACTORS` of the factor that is zero.
-        valid: (...,) bool, true where the point is reachable on both branches.
+        distance: (...,) m; NaN for points that are not valid.
+        point: (..., 3) m, singular position of P at this distance; NaN for points not valid.
+        factor: (...,) index in :data:`FACTORS` of the factor that is zero; -1 for points not valid.
+        valid: (...,) bool, true where the working mode and the assembly mode reach the point.
     """
 
     distance: FloatArray
@@ -130,10 +131,10 @@ def nearest_singularity(
 ) -> NearestSingularity:
     """Find the nearest singular position of points (..., 3) m, in Cartesian space.
 
-    Its distance is the radius of the largest ball about the point in which P can move without a
-    singularity of any kind. Distances to the planes y = 0 and |y| = l7 and to the boundary of leg 3
-    are exact, the others numerical. Points that are not finite, or not on both branches, are not
-    valid.
+    The distance is the radius of the largest ball about the point such that P can move in the ball
+    without a singularity of any kind. Distances to the planes y = 0 and |y| = l7 and to the
+    boundary of leg 3 are exact, the others numerical. Points are not valid if they are not finite,
+    or not reachable in the working mode ``branch`` and the assembly mode ``assembly``.
     """
     require_mode(assembly, AssemblyMode)
     points = numbers("position", position)

@@ -8,8 +8,8 @@ Two independent counts of the degrees of freedom start from the axes of the join
 
 Both agree at singularities too. If z_C1 = z_B1, both find 4 instantaneous freedoms, because link 3'
 can begin to turn about y. Vectors are in the paper frame. Functions of joint angles take three
-finite numbers and raise InputError for anything else. They raise UnreachableError if the branch
-does not exist there.
+finite numbers and raise InputError for anything else. They raise UnreachableError if the assembly
+mode does not exist at these angles.
 """
 
 from collections.abc import Mapping
@@ -36,7 +36,8 @@ class Structure:
         branches: Branches I, II (base to link 3') and III (base to platform 1).
         wrist: R12 and R13, from link 3' to platform 1.
         link_3p: (3,) m, base point C1 of link 3'.
-        platform: (3,) m, base point E1 of platform 1, on the axis of R13: no element is dependent.
+        platform: (3,) m, base point E1 of platform 1. It lies on the axis of R13, so that no
+            element of a POC set depends on the others.
     """
 
     branches: tuple[Chain, Chain, Chain]
@@ -151,7 +152,7 @@ def mobility(
 
 
 def mobility_at(mechanism: Mechanism, angles: Mapping[str, float]) -> Mobility:
-    """Count the freedoms of any mechanism like :func:`mobility`.
+    """Count the freedoms of any mechanism, as :func:`mobility` does for the TPM.
 
     ``angles`` has the position of each joint by name, rad (m for a slide).
     """

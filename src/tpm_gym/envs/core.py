@@ -364,7 +364,7 @@ class Core:
         return EnvSnapshot(self.kind, self._save_simulation(), rngs, copies)
 
     def _save_simulation(self) -> Snapshot:
-        """Return a snapshot; read :attr:`state` again, since saving restarts the simulation."""
+        """Return a snapshot, and update :attr:`state`, since saving restarts the simulation."""
         snapshot = self.simulation.save()
         self._state = self.simulation.state()
         self._newest = _view(self._state)[None]
@@ -511,7 +511,10 @@ def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: An
 
 
 def _require_goals(size: int, achieved: ArrayLike, desired: ArrayLike) -> None:
-    """Refuse arrays without the shapes of goals; goals that are not finite are failures."""
+    """Raise InputError if arrays do not have the shapes of goals.
+
+    Goals that are not finite are accepted, and count as not achieved.
+    """
     shapes = [numbers("achieved_goal", achieved).shape, numbers("desired_goal", desired).shape]
     try:
         np.broadcast_shapes(*shapes)

@@ -58,7 +58,7 @@ class Rendering:
 
 
 class Pixels:
-    """Pictures as observations, instead of the entries that a camera measures.
+    """Pictures as observations; they replace the entries of the objects.
 
     Raises:
         ConfigurationError: If an option is out of range.

@@ -37,18 +37,18 @@ __all__ = ["BrakingShield", "Shield", "make_shield"]
 MARGIN = 0.15
 """Extra conditioning to keep with servo drives or other plants, as a fraction of the safe one."""
 TOLERANCE = 2e-5
-"""Conditioning above ``least`` that is wanted at commands.
+"""Amount by which the conditioning at commands should exceed ``least``.
 
-The check of a path demands half of it; the other half is for errors between the nodes.
+The check of a path demands half of it; the other half is a reserve for errors between the nodes.
 """
 _FAR = 1.05
-"""Ratio to ``Shield.least`` of the conditioning at three successive commands, from which on the
-path between them is safe without a check."""
+"""If the conditioning at three successive commands is at least this multiple of ``Shield.least``,
+the path between them is safe, and is not checked."""
 _STEPS = 6  # largest number of steps of sequential quadratic programming
 _CLOSE = 0.005  # step, in units of the action, that ends the search: the next is 100 times smaller
 _ROUNDS = 3  # largest number of times that the aim is raised, if a path is less safe than its ends
 _HALVINGS = 20
-_PARTINGS = 8  # halvings between braking and the wanted command
+_PARTINGS = 8  # halvings between the braking and the wanted command
 _LONGEST = 200  # largest number of control steps until a robot that brakes is at rest
 _SWEEPS = 200  # largest number of sweeps over the constraints of a quadratic program
 _NUDGE = 1e-4  # displacement for derivatives of the conditioning, as a fraction of the step limit
@@ -128,7 +128,7 @@ class Shield:
         return command
 
     def _lack(self, corners: FloatArray) -> FloatArray:
-        """Return by how much (r,) paths are not safe; their corners m, c, d are (r, 3, 3) m."""
+        """Return the conditioning (r,) that paths lack; their corners m, c, d are (r, 3, 3) m."""
         return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
@@ -190,8 +190,9 @@ class BrakingShield:
 
     A command is safe if the conditioning stays at ``least`` or above on its path, and while the
     robot brakes after it as hard as the follower allows. No torque may exceed the motors' peak. So
-    it is always safe to brake, because the rest of the last braking is safe. An unsafe command is
-    moved in a straight line towards the command with which the robot brakes.
+    it is always safe to brake: braking after the last command was part of the check of that
+    command. An unsafe command is moved in a straight line towards the command with which the robot
+    brakes.
 
     Args:
         machine: Nominal machine.
@@ -204,9 +205,10 @@ class BrakingShield:
         self._machine, self._follower, self.least = machine, follower, least
 
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
-        """Return safe commands (n, 3) m between braking and the wanted ones.
+        """Return safe commands (n, 3) m between the braking commands and the wanted ones.
 
-        A robot that starts with less conditioning gets commands that are no worse than braking.
+        If even braking leads below ``least``, the smallest conditioning with the returned command
+        is no smaller than with braking.
 
         Args:
             wanted: (n, 3) m, commands by control and follower, machine's frame.
@@ -261,8 +263,9 @@ def make_shield(
         exact: Whether the robot follows its commands exactly. If not, True adds the ``MARGIN``.
 
     Raises:
-        ConfigurationError: If the option is neither True nor a conditioning below home's, or the
-            machine may pass a singularity.
+        ConfigurationError: If the option is neither True nor a number in (0, 1], if the
+            conditioning at home is below the one to keep, or if the machine is made to pass a
+            singularity.
     """
     if machine.mirror_axis is not None:
         valid = f"False: {machine.name!r} has to pass a singularity here"

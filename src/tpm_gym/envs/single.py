@@ -114,8 +114,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     | term | value |
     | --- | --- |
-    | goal, sparse | 0 if the distance is below the tolerance, else -1: 10 mm, Throw 20, Cycle 2 |
-    | goal, dense | minus the distance in units of 0.1 m; Cycle: more near the goal |
+    | goal, sparse | -1; 0 if the distance is below the tolerance: 10 mm, Throw 20, Cycle 2 |
+    | goal, dense | minus the distance in units of 0.1 m; Cycle: steeper within 10 mm of the goal |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
     | gate | minus the depth of P below the gate, in units of 5 mm |
@@ -170,12 +170,13 @@ class TPMEnv(gym.Env[Observation, Action]):
             has registered, or a :class:`~tpm_gym.Machine`; a spec that is written as JSON needs a
             name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
-            the singularity, for machines whose goals are near one.
+            a singularity; only for machines whose goals are near a singularity.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
             100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
-            its attributes has 7500 N m/rad, 60 N m s/rad, the torques of the nominal motion fed
-            forward, and 100 N m up to 18.75 rad/s, which fall to zero at 25 rad/s.
+            its attributes lags behind the references. Its defaults for stiffness and damping are
+            7500 N m/rad, 60 N m s/rad; the torques of the nominal motion are fed forward. Its
+            largest torque is 100 N m up to 18.75 rad/s, and falls to zero at 25 rad/s.
         randomisation: Differences from the nominal machine, drawn for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Position and
             velocity keep their last values while disturbed encoders report joint positions that
@@ -191,8 +192,9 @@ class TPMEnv(gym.Env[Observation, Action]):
             a display. ``"rgb_array"``: (height, width, 3) uint8. ``"depth_array"``: (height, width)
             float32, distance along the camera's axis in m, infinite where there is no body.
             ``"rgbd_tuple"``: both. ``"segmentation"``: (height, width) int32, 0 background and
-            floor, 1 table, 2 robot, 3 vacuum cup, 4 + k object k. Goal markers have colours only.
-        renderer: Renderer of pictures; for PyBullet ``"tiny"`` (any machine) or ``"egl"`` (GPU),
+            floor, 1 table, 2 robot, 3 vacuum cup, 4 + k object k. Goal markers are in colours only,
+            not in distances or segmentation.
+        renderer: Renderer of pictures; for PyBullet ``"tiny"`` (any computer) or ``"egl"`` (GPU),
             for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the first that works.
         camera: ``"table"`` (task region, close by), ``"overview"`` (whole robot), ``"cup"``
             (follows the cup), a :class:`~tpm_gym.simulation.Camera`, or a mapping of its

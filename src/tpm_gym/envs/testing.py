@@ -91,7 +91,7 @@ def fingerprint(steps: Iterable[Step]) -> str:
 
 
 def bits(value: Any) -> Any:
-    """Return nested results with bytes for arrays, so that == compares every bit."""
+    """Return nested results with arrays replaced by their bytes, so that == compares every bit."""
     if isinstance(value, dict):
         return {name: bits(entry) for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -259,7 +259,7 @@ def bad_actions(size: int) -> Iterator[Any]:
 
 
 def refuses_bad_actions_and_has_not_moved_then(make: Make) -> None:
-    """Step with values that are no actions, and compare the steps after it."""
+    """Step with values that are no actions; check that state and later steps do not change."""
 
     def run(env: Env, hostile: bool) -> Any:
         half: NDArray[Any] = np.full(env.action_space.shape or (), 0.5)
@@ -349,7 +349,7 @@ def refuses_steps_outside_an_episode(make: Make) -> None:
 
 
 def continues_copies_and_snapshots_equally(make: Make) -> None:
-    """Save, copy and pickle in an episode, and compare all of them until the next reset."""
+    """Continue an episode, its snapshot, a copy and a pickle; compare them until the next reset."""
     with closing(make()) as env, closing(make()) as restored:
         steps = min(15, _steps_of(env) // 2)
         for other in (env, restored):  # wrappers count their own steps

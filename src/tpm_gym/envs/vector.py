@@ -277,7 +277,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
         Args:
             count: Number of environments; all of them if there are fewer.
-            columns: Environments in a row; None for about as many as rows.
+            columns: Pictures in each line; None for about as many as there are lines.
 
         Raises:
             ConfigurationError: If ``render_mode`` is None or ``"rgbd_tuple"``.
@@ -454,7 +454,7 @@ class _Part:
         }
 
     def require_equal(self, snapshot: Any) -> None:
-        """Raise InputError unless it is a snapshot of an equal part of a vector environment."""
+        """Raise InputError unless ``snapshot`` is of an equal part of a vector environment."""
         self.core.require_equal(snapshot)
         if "elapsed" not in snapshot.columns:
             valid = "from save_state() of a vector environment, which counts steps"

@@ -6,7 +6,7 @@ depend on a C library. They are accurate to two units in the last place, ``cos_t
 Their polynomials are minimax fits (Remez's exchange, in 60 digits). A test compares the functions
 with mpmath.
 
-After this import, compiled functions can also call :mod:`tpm_gym.kinematics.equations`.
+Importing this module lets compiled functions call :mod:`tpm_gym.kinematics.equations`, too.
 """
 
 import math
@@ -51,7 +51,10 @@ def _six(c: tuple[float, ...], k: int, x: float) -> float:
 
 
 def _sin_cos(x: float) -> tuple[float, float, float]:
-    """Return sin(r), cos(r) and k, 0 to 3, for x = r + k pi / 2 + full turns, |r| <= pi / 4."""
+    """Return sin(r), cos(r) and k, where x = r + k pi / 2 + full turns.
+
+    |r| is at most pi / 4, and k is 0, 1, 2 or 3.
+    """
     whole = (x * (2.0 / math.pi) + _TO_WHOLE) - _TO_WHOLE
     whole = whole if abs(whole) <= _TURNS else math.nan
     r = ((x - whole * _HALF_PI[0]) - whole * _HALF_PI[1]) - whole * _HALF_PI[2]

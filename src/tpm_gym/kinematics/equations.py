@@ -1,8 +1,8 @@
 """Closed-form equations of the mechanism, for floats, arrays and tensors.
 
 The paper's frame O-xyz: origin in the middle of the base, base plane z = 0, z from the base towards
-the platform; metres and radians. The mechanism has two loops of coupling degree zero, so both
-problems reduce to intersecting circles. We solve those intersections as vectors and as
+the platform; metres and radians. The mechanism has two loops of coupling degree zero, so forward
+and inverse kinematics reduce to intersections of circles. These are solved as vectors and as
 ``a cos + b sin = c``, not with the paper's half-angle forms (Eqs. 13 and 15), which break where
 ``g_i = 0`` or ``theta_i = pi``.
 
@@ -26,14 +26,16 @@ from tpm_gym.kinematics.modes import AssemblyMode, WorkingMode
 from tpm_gym.kinematics.namespaces import NUMPY, Namespace, Numbers, namespace_of
 
 ROUNDING = 64 * sys.float_info.epsilon
-"""Largest amount by which a discriminant (scaled to order one) counts as zero if it is below zero.
-Where two solutions merge, rounding can make it negative; they still count as solutions."""
+"""A discriminant, scaled to order one, counts as zero if it is below zero by at most this amount.
+Where two solutions merge, rounding can make it negative although the solutions exist."""
 _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
-"""Limit below which a factor of det A counts as zero. cos(beta) has an error of about 1e-14. Where
-cos(beta) is 1, the error of sin(beta) is the square root of that (50 nm in y)."""
+"""Limit below which a factor of det A, divided by lengths, counts as zero. For sin(beta) and the
+paper's lengths, this is 50 nm in y. cos(beta) has an error of about 1e-14. So near cos(beta) = 1,
+sin(beta) has an error of about 1e-7, which is below the limit."""
 LEAST = 1e-30
-"""Smallest det A, m^3, for which the conditioning is computed; below, its terms could overflow."""
+"""Smallest det A, m^3, for which the conditioning is computed. For a smaller one, terms of the
+conditioning could overflow."""
 
 _TINY = sys.float_info.min  # the smallest divisor
 
@@ -118,10 +120,10 @@ def assembly_at(
     second centre has a positive planar factor, the other intersection a negative one.
 
     Returns:
-        The assembly; whether it is real; and values that explain a failure: whether xC and zC are
-        real and rod 11 fits (if the assembly is not real, it fits for any beta: a2 = b2 = 0), y1,
-        the squared distance of the circles, and the level and vertical distances from B3 to C3 for
-        a link 7 of length 0, m.
+        The assembly; whether it is real; and five values that explain why it is not: whether xC and
+        zC are real and rod 11 fits; y1, m; the squared distance of the circles' centres, m^2; and
+        the level and the vertical distance from B3 to C3 for a link 7 of length 0, m. If rod 11
+        fits although the assembly is not real, then a2 = b2 = 0, and rod 11 fits for every beta.
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]
@@ -157,8 +159,9 @@ def posture_at(
 
     Returns:
         theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
-        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For the margins, how far
-        C_i is from A_i along the arm's plane, level for each leg and vertical for leg 3, m.
+        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For :func:`leg_margin`,
+        distances of C_i from A_i in the arm's plane, m: the level distances of legs 1, 2 and 3, and
+        the vertical distance of leg 3.
     """
     x, y, z = point
     side, bend1, bend2, bend3 = signs
@@ -272,9 +275,10 @@ def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Trip
 def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
     """Compute smallest over largest singular value, s3 / s1, of a matrix (3, 3).
 
-    The matrix of cofactors has the largest singular value s1 s2, and |det| = s1 s2 s3. The root of
-    the smallest eigenvalue of J J^T would lose half of the digits of s3. Where s1 and s2 nearly
-    coincide, the result is accurate to 1e-9 only.
+    |det| = s1 s2 s3, and the matrix of cofactors has the largest singular value s1 s2. So this is
+    |det| divided by s1 and by s1 s2. If s3 were computed as the root of the smallest eigenvalue of
+    J J^T, half of its digits would be lost. Where s1 and s2 nearly coincide, the result is accurate
+    to 1e-9 only.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)

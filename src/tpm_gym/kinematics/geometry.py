@@ -8,8 +8,9 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Share of l1 below which the least y_B1, l5 and |l5 - l1| count as 0. If y_B1 and another of them
-do, the circles of Eq. (6) can nearly coincide, and their intersections would be inaccurate."""
+"""Fraction of l1 below which a length counts as 0. If l1 - l3 (the smallest y_B1) counts as 0, and
+so does l5 or |l5 - l1|, the circles of Eq. (6) can nearly coincide. Their intersections would be
+inaccurate."""
 
 
 class Lengths(NamedTuple):
@@ -38,8 +39,8 @@ class Geometry:
         l7: Link 7, D_1E_1; the workspace reaches y = -l7 to l7.
 
     Raises:
-        GeometryError: If a length is no finite positive number (l6 may be 0), if rods 4 cannot
-            reach the plane of link 3', or if the circles of Eq. (6) can coincide.
+        GeometryError: If a length is no finite positive number (l6 may be 0), if rods 4a and 4b
+            cannot reach the plane of link 3', or if the circles of Eq. (6) can coincide.
     """
 
     l1: float

@@ -62,8 +62,8 @@ def parallel(
     """Compute the parallel Jacobian A of A v = B theta_dot, (..., 3, 3) m.
 
     Eliminating the passive angle beta through y = l7 sin(beta) gives dxC = dx + tan(beta) dy. Rows
-    1 and 2 are multiplied by cos(beta), which keeps A finite at y = +-l7; so
-    det A = -cos(beta) times the product of the factors of Eq. (16).
+    1 and 2 are multiplied by cos(beta), which keeps A finite at y = +-l7. So det A = -cos(beta)
+    times the product of the factors of Eq. (16).
     """
 
     def results(c: _Configuration) -> list[Numbers]:
@@ -80,8 +80,8 @@ def serial(
 ) -> FloatArray:
     """Compute the serial Jacobian B of A v = B theta_dot, (..., 3, 3) m^2/rad, diagonal.
 
-    With the row scaling of :func:`parallel`; so det B = cos(beta) times the product of the factors
-    of Eq. (17).
+    Rows 1 and 2 are multiplied by cos(beta), as in :func:`parallel`. So det B = cos(beta) times the
+    product of the factors of Eq. (17).
     """
 
     def results(c: _Configuration) -> list[Numbers]:
@@ -96,8 +96,8 @@ def velocity(
 ) -> FloatArray:
     """Compute the velocity Jacobian J with v = J theta_dot, (..., 3, 3) m/rad.
 
-    J = A^-1 B wherever A can be inverted. It exists at the serial singularities too (where
-    cos(beta) = 0 makes both A and B singular).
+    J = A^-1 B wherever A can be inverted. J also exists at serial singularities, even where
+    cos(beta) = 0 and so both A and B are singular.
 
     Raises:
         SingularityError: If theta is a parallel singularity, where J does not exist.
@@ -134,7 +134,10 @@ def conditioning_at(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: AnyLengths = PAPER,
 ) -> FloatArray:
-    """Compute 1/cond(J) at points, (...,); 0 where they are not reachable on both branches.
+    """Compute 1/cond(J) at points, (...,).
+
+    It is 0 unless a point is reachable in the working mode ``branch`` and in the assembly mode
+    ``assembly``.
 
     To differentiate by the lengths, pass points as a tensor and the lengths as tensors in a
     :class:`tpm_gym.kinematics.geometry.Lengths`.

@@ -2,8 +2,8 @@
 
 Branches are named by signs that change only at a singularity:
 
-* an :class:`AssemblyMode` (forward kinematics, 4 of them) by the signs of the two factors of the
-  parallel Jacobian's determinant that the branches differ in;
+* an :class:`AssemblyMode` (forward kinematics, 4 of them) by the signs of the planar factor and of
+  sin(beta), two of the three factors of the parallel Jacobian's determinant;
 * a :class:`WorkingMode` (inverse kinematics, 16 of them) by the signs of the four factors of the
   serial Jacobian's determinant.
 """
@@ -75,11 +75,11 @@ class RotatedMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: the side on
-            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. Where rods 4
-            appear shorter than links 3, -1 names the two assemblies of link 3' with the smaller
-            factors.
-        further: -1 for the smaller and 1 for the larger tilt phi of the two assemblies of link 3'
-            with this sign; phi is in [0, 2 pi).
+            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. Where rods 4a
+            and 4b, seen along y, are shorter than links 3 and 3', -1 names the two assemblies of
+            link 3' with the smaller planar factors.
+        further: Names one of the two assemblies of link 3' with the same ``planar``: -1 has the
+            smaller tilt phi in [0, 2 pi), 1 the larger one.
         sin_beta: Sign of sin(beta), and so of y.
     """
 
@@ -105,7 +105,7 @@ WORKING_MODES = tuple(WorkingMode(*signs) for signs in product((-1, 1), repeat=4
 """All inverse branches, in the order of the slots of :func:`inverse_all`."""
 
 DEFAULT_ASSEMBLY = AssemblyMode(planar=-1, sin_beta=1)
-"""Assembly mode of the environments: platform on the far side of the base, y > 0."""
+"""Assembly mode of the environments: the platform is at y > 0, on the side z > 0 of the base."""
 
 ELBOWS_OUT = WorkingMode(cos_beta=1, leg1=1, leg2=-1, leg3=1)
 """Working mode of the environments: arms bent away from the centre, as a delta robot's."""

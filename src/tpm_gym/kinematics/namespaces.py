@@ -57,7 +57,7 @@ class Namespace:
 
 
 def namespace_of(*values: object) -> Namespace:
-    """Return the namespace for arrays like the arguments; that of tensors if one is a tensor."""
+    """Return the namespace of tensors if an argument is a tensor, else the namespace of arrays."""
     return _torch() if any(map(is_tensor, values)) else NUMPY
 
 
@@ -89,7 +89,7 @@ NUMPY = Namespace(
 def _torch() -> Namespace:
     """Return the namespace for tensors.
 
-    Infinite derivatives are set to 0, or derivatives of other branches would become NaN.
+    Infinite derivatives are set to 0; otherwise, derivatives of other branches would be NaN.
     """
     import torch  # here, since torch is optional
 

@@ -86,7 +86,7 @@ def assembled(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> For
 
 
 def _assemblies(theta: equations.Triple, g: Geometry, ns: Namespace) -> list[Any]:
-    """Compute position and beta in all slots: both planar signs; y < 0 is the mirror image."""
+    """Compute position and beta in all slots: solve for y > 0, and mirror the results to y < 0."""
     cos, sin = equations.arms(theta, g, ns)
     planar = ns.signs(theta[0], (2, 1))
     found, real, (reached, *_) = equations.assembly_at(cos, sin, planar, 1.0, g, ns)

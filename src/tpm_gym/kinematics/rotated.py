@@ -1,10 +1,10 @@
 """The second operation mode: link 3' and the platform turned about y, in closed form.
 
-Seen along y, branch I is a four-bar linkage with opposite sides of equal length: rods 4a and 4b,
-and links 3 and 3'. In the paper's mode it is a parallelogram, in which link 3' only translates. In
-the second mode it is an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y,
-halves the angle between links 3 and 3'. Branch II lets link 3' turn about y, and branch III lets
-the platform turn with it.
+Seen along y, leg 1 is a four-bar linkage with opposite sides of equal length: rods 4a and 4b, and
+links 3 and 3'. In the paper's mode it is a parallelogram, in which link 3' only translates. In the
+second mode it is an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y, halves
+the angle between links 3 and 3'. Leg 2 lets link 3' turn about y, and leg 3 lets the platform turn
+with it.
 
 Both modes meet at the constraint singularity, z_C1 = z_B1. There all four sides of the linkage,
 seen along y, lie on one line, and the linkage can move on in either mode.
@@ -202,10 +202,10 @@ def _zeros(values: FloatArray) -> tuple[FloatArray, BoolArray]:
 
 @np.errstate(all="ignore")
 def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Planar, FloatArray]:
-    """Compute C1 (xC + i zC, m) and tilt (rad) of link 3' turned at theta (..., 3), each (..., 4).
+    """Compute C1 (xC + i zC, m) and tilt (rad) of the turned link 3', (..., 4) each.
 
-    Missing solutions are NaN. There is a slot for each pair of signs (planar, further) of
-    :data:`.modes.ROTATED_MODES`.
+    ``theta`` is (..., 3) rad. Missing solutions are NaN. There is a slot for each pair of signs
+    (planar, further) of :data:`.modes.ROTATED_MODES`.
 
     Seen along y, the vector from B1 to C1 is rho n with n = exp(-i phi / 2), since it halves the
     angle between links 3 and 3'. Then rods 4a and 4b have the same closure, which gives rho^2. With

@@ -1,8 +1,8 @@
-"""Algorithms of Stable-Baselines3: a row of the table for each, and the entries of its recipes.
+"""Algorithms of Stable-Baselines3, and the entries of their recipes.
 
 A row of ``ALGORITHMS`` and a file ``train/recipes/<name>.yml`` are enough to train, resume,
-evaluate and export with another algorithm. An argument that no earlier algorithm has needs a row in
-``_ENTRIES``.
+evaluate and export with another algorithm. If it has an argument that is not in ``_ENTRIES`` yet,
+add a row there.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Algorithm:
         return found
 
     def argument(self, given: Mapping[str, Any], name: str) -> Any:
-        """Return an argument of the constructor, given or default; None if it has none."""
+        """Return an argument of the constructor, given or default; None if there is no such one."""
         parameters = inspect.signature(self.load_class()).parameters
         return given.get(name, parameters[name].default if name in parameters else None)
 

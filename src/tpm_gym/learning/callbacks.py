@@ -29,8 +29,8 @@ _LARGEST_SHARE: Final = 0.02  # largest fraction of the time for writing checkpo
 class PeriodicEvaluation(BaseCallback):
     """Evaluation of the policy on held-out seeds before, during and after training.
 
-    All evaluations use the same episodes. Each is appended to evaluations.jsonl with the training
-    time so far, s: wall-clock time, and CPU time of the main process (without workers).
+    All evaluations use the same episodes. Each is appended to evaluations.jsonl, with the training
+    time so far in seconds: wall-clock time, and CPU time of the main process (without workers).
 
     ``envs`` are separate, so that evaluations do not disturb training. ``keep`` is called with the
     model whenever it is the best so far.
@@ -136,9 +136,9 @@ class StopTrainingError(Exception):
 class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
-    A checkpoint that cannot be written is reported, and tried again when the next one is due. The
-    first one is saved before training, so that each policy has a checkpoint. ``seconds`` is the
-    training time in earlier processes, s.
+    If a checkpoint cannot be written, a warning is printed, and training continues until the next
+    checkpoint is due. The first checkpoint is saved before the first policy, so that a run with a
+    saved policy has a checkpoint. ``seconds`` is the training time in earlier processes, s.
     """
 
     config: TrainingConfig

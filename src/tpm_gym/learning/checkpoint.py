@@ -151,7 +151,7 @@ def _read(path: Path) -> Content:
 
 
 def starting(arrays: Mapping[str, NDArray[Any]], prefix: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays with a prefix, under their names without it."""
+    """Return the arrays whose names start with ``prefix``, and remove it from the names."""
     return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
 
 

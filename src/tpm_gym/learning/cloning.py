@@ -12,10 +12,10 @@ from torch.nn import functional
 _RATE: Final = 1e-3
 _BATCH: Final = 256
 _BETA: Final = 0.1
-"""Error of an action at which the loss becomes linear.
+"""Error of an action above which the loss is linear; below, it is quadratic.
 
-In similar states, for example where its path turns, the expert takes two different actions. A
-squared loss would teach their mean, which is neither of them.
+In similar states, for example where the expert's path turns, the expert takes two different
+actions. A squared loss would teach their mean, which is neither of them.
 """
 _VALUE_EPOCHS: Final = 3
 

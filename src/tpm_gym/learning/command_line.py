@@ -26,7 +26,7 @@ class ExportConfig:
     """best.zip or last.zip in the folder of a run, or an exported policy (.json)."""
 
     out: Annotated[Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Common name of the new files; an earlier policy is replaced, no other files."""
+    """Common name of the new files. An earlier policy is replaced; other files never are."""
 
     trust_pickle: bool = False
     """Load a .zip file, which can run any code."""
@@ -49,7 +49,7 @@ Command = (
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command line, by default ``sys.argv``, and exit with its status.
 
-    A command that a signal stops exits with 128 plus the number of the signal, as in shells.
+    If a signal stops the command, the status is 128 plus the signal's number, as in shells.
     """
     about = "Train and test policies for the robot of tpm_gym."
     options: Any = {"config": (tyro.conf.FlagCreatePairsOff,), "args": words}

@@ -24,7 +24,7 @@ from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
 from tpm_gym.learning.run_folder import CONFIG_FILE
 
 UNSET: Final[Any] = None
-"""Value of an option that :func:`complete` computes, or that a resumed run keeps."""
+"""Value of an option that is not given; :func:`complete` or the resumed run determines it."""
 
 _MOST_PROCESSES: Final = 1000
 _MOST_THREADS: Final = 1024
@@ -59,7 +59,7 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_shield(words: Sequence[str]) -> bool | float:
-    """Parse the words after ``--shield``: ``True`` or none, ``False``, or a conditioning."""
+    """Parse the words after ``--shield``: True, False or a conditioning; no word means True."""
     text = " ".join(words) or "True"
     return text == "True" if text in ("True", "False") else float(text)
 
@@ -139,8 +139,8 @@ class TrainingConfig:
     """Hyperparameters in that file."""
 
     demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
-    """Episodes of the expert that are taught at the start, rounded up to a multiple of <envs>; 0
-    for none."""
+    """Number of the expert's episodes to learn from at the start, rounded up to a multiple of
+    <envs>; 0 for no demonstrations."""
 
     run: Annotated[Path, unset(Path, "runs/<env>-<algo>-s<seed>", "FOLDER")] = UNSET
     """Folder of the run."""
@@ -165,14 +165,15 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes in each engine of the last test, which follows a training in --engine analytic; 0
-    for none."""
+    """Episodes of the final test in each engine; 0 for no test. Only a training in --engine
+    analytic ends with a test: of the best policy, in that engine and in PyBullet."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
-    """Steps between checkpoints. By time: every 30 s, for at most 2% of the time."""
+    """Steps between checkpoints. By time: every 30 s, or less often, so that saving takes at most
+    2% of the time."""
 
     threads: int = 1
-    """Threads of PyTorch. One is fastest for small networks, and repeats exactly."""
+    """Threads of PyTorch. With one, small networks are fastest, and results repeat exactly."""
 
     device: str = "cpu"
     """Device of PyTorch, such as cpu or cuda."""
@@ -186,7 +187,7 @@ class TrainingConfig:
         return self.envs * int(self.argument("train_freq") or self.argument("n_steps"))
 
     def argument(self, name: str) -> Any:
-        """Return an argument of the algorithm, given or default; None if it has none."""
+        """Return an algorithm's argument, given or default; None if there is no such argument."""
         return ALGORITHMS[self.algo].argument(self.recipe.arguments, name)
 
     @property
@@ -230,7 +231,7 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class ResumeConfig:
-    """Continue a training from its last checkpoint, with equal results."""
+    """Continue a training from its last checkpoint; results equal those of an uninterrupted run."""
 
     run: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="RUN")]]
     """Folder of the run."""
@@ -349,7 +350,7 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _check_numbers(config: TrainingConfig) -> None:
-    """Check the numbers that are given; they need no recipe."""
+    """Check the numbers that are given, as far as no recipe is needed."""
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
     check_least(config, 0, "test_episodes", "demonstrations")

@@ -138,8 +138,9 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
 
     Raises:
         ConfigError: An option is not valid, or a dataset is there already.
-        ConfigurationError: The environment has no such option, or not with this value.
-        MissingPackageError: Minari, h5py, or for replay PyTorch is not installed.
+        ConfigurationError: The environment does not have an option, or refuses its value.
+        MissingPackageError: Minari or h5py is not installed; the kind replay also needs PyTorch and
+            Stable-Baselines3.
     """
     console = console or Console()
     _require_packages(config.kind)

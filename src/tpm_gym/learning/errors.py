@@ -12,7 +12,7 @@ class ConfigError(LearningError, ValueError):
 
 
 class RunError(LearningError):
-    """Run folder that cannot be used: not empty, in use, no run, or not writable."""
+    """Run folder that is not empty, is in use, holds no run, or cannot be written."""
 
 
 class CheckpointError(LearningError):
@@ -24,7 +24,7 @@ class PolicyError(LearningError):
 
 
 class RolloutError(LearningError):
-    """Value of an episode that is not finite."""
+    """Value in an episode's record that is not finite."""
 
 
 class DivergedError(LearningError, ArithmeticError):
