@@ -104,7 +104,7 @@ class Result:
 
     @property
     def events(self) -> dict[str, str]:
-        """Labels of the metrics of the task's events, by name."""
+        """Metric of each event -> its table label, as in ``{"crossed_once": "crossed once"}``."""
         return {name: name.replace("_", " ") for name in self.records[0].events}
 
     def as_dict(self) -> dict[str, Any]:
@@ -192,7 +192,7 @@ def _common(option: str, values: Mapping[str, Any]) -> Any:
 def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
     """Return the names of machine, engine and drive, and the shield if one is given.
 
-    A name that is not given is the id's.
+    A name that is not given is the default of ``env_id``.
     """
     usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     if given.get("shield"):
@@ -279,7 +279,7 @@ def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[st
 
 
 def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
-    """Return one path per policy; with several policies, each file name contains the policy's."""
+    """Return one path per policy; several file names contain the names of their policies."""
     if len(policies) == 1:
         return [path]
     names = [Path(spec).stem for spec in policies]
@@ -289,7 +289,7 @@ def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
 
 
 def _film(config: EvaluationConfig, console: Console) -> None:
-    """Repeat the first episodes with rendering, which would slow the evaluation itself."""
+    """Repeat the first episodes with rendering, which is slow and not part of the evaluation."""
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
@@ -315,7 +315,7 @@ def _play(
     advance: Callable[[int], object],
     use: Callable[[Frame], object],
 ) -> None:
-    """Play episodes, and use every frame."""
+    """Play episodes; call ``use`` with every frame."""
 
     def frame() -> None:
         use(envs.render_tile(1))

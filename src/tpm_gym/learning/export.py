@@ -55,7 +55,8 @@ def save(
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Common name of the files. An earlier policy is replaced.
-        env_options: Machine, engine, drive and shield of the training, if they are not the id's.
+        env_options: Machine, engine, drive and shield of the training. Those left out are the
+            defaults of ``env_id``.
         versions: Versions at training; by default the installed ones.
 
     Raises:

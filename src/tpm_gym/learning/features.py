@@ -8,9 +8,9 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 class GoalGapExtractor(BaseFeaturesExtractor):
     """Features extractor that scales the distance to the goal.
 
-    Goals are in metres, and success depends on one centimetre. The features are therefore the
-    observation, which is of order one, and (desired - achieved) / unit. The achieved goal is part
-    of the observation already.
+    Goals are in metres, and a centimetre decides about success. The features are therefore the
+    observation, whose values are of order one, and (desired - achieved) / unit. The achieved goal
+    is part of the observation already.
     """
 
     def __init__(self, observation_space: spaces.Dict, unit: float = 0.05) -> None:
@@ -18,7 +18,7 @@ class GoalGapExtractor(BaseFeaturesExtractor):
 
         Args:
             observation_space: Space with ``observation``, ``achieved_goal`` and ``desired_goal``.
-            unit: Distance that becomes 1, m.
+            unit: Distance to the goal, m, whose feature is 1.
         """
         shown = ("observation", "desired_goal")
         size = sum(spaces.flatdim(observation_space[name]) for name in shown)

@@ -37,7 +37,7 @@ def style() -> AbstractContextManager[None]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a PNG without the program and date, which would change its bytes.
+    """Write a PNG without Matplotlib's version in its metadata, which would change the bytes.
 
     Drawing takes a second. It happens in memory, so that a process that is killed meanwhile leaves
     no part of a file.

@@ -2,10 +2,10 @@
 
 A file has one mapping for each environment id, in the style of rl-baselines3-zoo. Entries are the
 arguments of the algorithm's constructor, plus ``n_timesteps``, ``n_envs``, ``policy``, and
-``demonstrations``: episodes of the expert that are taught before training starts.
-Values are plain YAML and nothing is evaluated. Where the zoo evaluates a string such as
-``"dict(net_arch=[64, 64])"``, a mapping is written here, which the zoo reads as well. A file for
-several algorithms has such a mapping under the name of each: ``ppo``, ``sac``, ``tqc``.
+``demonstrations``: episodes of the expert from which the policy learns before training starts.
+Values are plain YAML, and nothing is evaluated. Where the zoo evaluates a string such as
+``"dict(net_arch=[64, 64])"``, a recipe here has a mapping, which the zoo reads too. A file for
+several algorithms has the recipes of each one under its name: ``ppo``, ``sac``, ``tqc``.
 """
 
 import re
@@ -60,8 +60,8 @@ class Recipe:
 
         Args:
             update: Steps between two updates, as a fraction of all steps. A falling learning rate
-                would reach zero one interval after the last update. With 0, as in
-                Stable-Baselines3, it is zero in the last update, which then changes nothing.
+                ends at this fraction of its first value, in the last update. With ``update=0``, as
+                in Stable-Baselines3, it ends at zero, and the last update changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):
@@ -106,7 +106,8 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
     """Return the alphabetically first algorithm with a recipe for an id.
 
-    If there is none, return the first one with a recipe that the id may use, or else ``"sac"``.
+    If there is none, return the first algorithm with a recipe of pick-and-place that the id can use
+    (see :func:`read_recipe`), or else ``"sac"``.
 
     Args:
         env_id: ``id`` or ``module:id``.

@@ -1,8 +1,8 @@
 """Rollouts of a policy over seeded episodes, and their metrics.
 
 Training uses seeds below ``SELECTION_SEED``. The periodic evaluations that select ``best.zip`` use
-seeds from ``SELECTION_SEED`` on, and ``tpm-gym evaluate`` seeds from ``TEST_SEED`` on. So no result
-comes from episodes that trained or selected the policy.
+seeds from ``SELECTION_SEED`` on. ``tpm-gym evaluate`` uses seeds from ``TEST_SEED`` on. So no
+result comes from episodes that trained or selected the policy.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Episode:
             from the simulated one, m.
         torque_rms: Root mean square of the motors' torques at the ends of the steps, N m.
         torque_peak: Largest of these torques, N m.
-        events: For each event of the task, as in ``{"crossed_once": True}``, whether it happened
-            after at least one step.
+        events: For each event of the task, as in ``{"crossed_once": True}``, whether the info of
+            at least one step reported it.
     """
 
     seed: int
@@ -111,7 +111,9 @@ def play(
     count: int,
     on_frame: Callable[[], object] | None = None,
 ) -> Iterator[Step]:
-    """Run an episode in each environment; yield steps until the first ``count`` have ended.
+    """Run an episode in each environment, and yield the steps.
+
+    Stop when the episodes of environments 0 to ``count - 1`` have ended.
 
     Args:
         first_seed: Environment i is reset with ``first_seed + i``.
@@ -143,7 +145,8 @@ def run_episodes(
     """Run a policy for a number of episodes; equal arguments give equal records.
 
     Args:
-        envs: Environments with next-step autoreset, as many as run at a time; left open.
+        envs: Environments with next-step autoreset. Each plays one episode at a time. They are
+            not closed.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episodes: Called with the number of episodes that have just ended, as for a progress bar.
@@ -167,7 +170,7 @@ def _run_together(
     count: int,
     on_frame: Callable[[], object] | None,
 ) -> list[Episode]:
-    """Run an episode in each environment; return the records of the first ``count``."""
+    """Run an episode in each environment; return records of environments 0 to ``count - 1``."""
     steps: list[dict[str, Any]] = []
     lengths = np.zeros(envs.num_envs, dtype=np.int64)
     # The metric of an event is the share of episodes that had it.
@@ -225,8 +228,8 @@ def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     """Return the metrics of an evaluation by name, each with its 95% interval over episodes.
 
     Success rates and shares of episodes with an event have Wilson intervals, which are valid at 0
-    and 1 too. Other metrics have percentile bootstrap intervals. Extremes also have the worst value
-    of all episodes.
+    and 1 too. Other metrics have percentile bootstrap intervals. The lowest conditioning, the
+    largest errors and the torques also have the value of the worst episode.
     """
     rows = [record.as_dict() for record in records]
     found = {}

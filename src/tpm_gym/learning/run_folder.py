@@ -93,7 +93,8 @@ def description(run: Path) -> dict[str, Any] | None:
 def resume_command(run: Path) -> str:
     """Return the command line that resumes a run.
 
-    It repeats an id ``module:id``, because no module is imported only because a file names it.
+    An id with a module, ``module:id``, is part of the command: a module is imported if the user
+    names it, but not if only a file does.
     """
     env = str((description(run) or {}).get("env", ""))
     return shlex.join(["tpm-gym", "resume", str(run), *(["--env", env] if ":" in env else [])])

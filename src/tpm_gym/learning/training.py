@@ -57,7 +57,7 @@ _CHANGEABLE: Final = {
     **dict.fromkeys(("steps", "eval_every", "checkpoint_every", "threads"), int),
     "device": str,
 }
-"""Options that resuming can change, and their types; the id stays."""
+"""Options that resuming can change, and their types. The environment id cannot change."""
 
 
 def train(config: TrainingConfig, console: Console | None = None) -> signal.Signals | None:

@@ -1,7 +1,7 @@
 """State of a training between two rollouts, saved and restored bit by bit.
 
-A restored training continues as if it had not been interrupted, on one thread of one kind of
-machine. A resumed hindsight training looks untrained if one of three things is missing:
+On one thread, and on the same kind of computer, a restored training continues as if it had not been
+interrupted. A resumed hindsight training looks untrained if one of three things is missing:
 
 - the count of steps: Stable-Baselines3 acts at random for the first ``learning_starts`` steps;
 - the optimisers;
@@ -223,7 +223,7 @@ def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Return the position in the replay buffer and views of its filled part, if there is one."""
+    """Return the replay buffer's position and views of its filled part; empty without a buffer."""
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, DictReplayBuffer):
         return {}

@@ -54,9 +54,10 @@ _SPACE: Final[Mapping[str, Sequence[float]]] = {
     "max_grad_norm": (0.5, 2.0, 5.0),
     "policy_kwargs.log_std_init": (-1.5, -1.0, -0.5, 0.0),
 }
-"""Values to choose from, by entry of the recipe; an algorithm uses those that it has.
+"""Values to choose from, by entry of the recipe.
 
-A learning rate of the recipe that falls to zero falls in the variants too.
+Entries that an algorithm does not have are not searched. If the learning rate of the recipe falls
+to zero, the chosen learning rate does too.
 """
 
 

@@ -1,4 +1,4 @@
-"""The robot as data: bodies and joints, machines, mount and cup, and files other tools read."""
+"""The robot as data: bodies and joints, machines, mount and cup, and files for other tools."""
 
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism.delta.machine import DELTA, Delta

@@ -42,8 +42,8 @@ class Solid:
     """A homogeneous box or cylinder, possibly hollow, fixed to a link.
 
     Attributes:
-        kind: ``"box"`` with full edge lengths, or ``"cylinder"`` along its own axis.
-        size: Box: edges (x, y, z). Cylinder: (radius, length, 0). In m.
+        kind: ``"box"``, or ``"cylinder"`` along ``axis``.
+        size: Box: full edges (x, y, z), m. Cylinder: (radius, length, 0), m.
         centre: Position in the link's frame, m.
         density: Density of the material, kg/m^3; zero for parts that are only drawn.
         bore: Size of the hollow, m. Box: edges (x, y, z). Cylinder: (inner radius, length, 0). All
@@ -120,7 +120,7 @@ class Joint:
     """Joint between a link and its parent.
 
     Attributes:
-        name: Name of the joint; the paper's where it has one.
+        name: Name of the joint, as in the paper if the paper names it.
         kind: URDF joint type.
         parent: Name of the parent link.
         origin: Position of the joint in the parent's frame, m.
@@ -187,7 +187,7 @@ class Closure:
     """A ball joint that closes a loop: two points that must coincide.
 
     Attributes:
-        name: Name of the joint; the paper's where it has one.
+        name: Name of the joint, as in the paper if the paper names it.
         link_a: Link on one side.
         point_a: Point in the frame of ``link_a``, m.
         link_b: Link on the other side.

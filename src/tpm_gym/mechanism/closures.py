@@ -52,7 +52,19 @@ def moving_joints(mechanism: Mechanism) -> list[str]:
 def rates(
     mechanism: Mechanism, places: Mapping[str, Place], name: str, offset: Vector
 ) -> tuple[FloatArray, FloatArray]:
-    """Return velocity (m/rad) of a link's point and angular velocity of the link, (3, joints)."""
+    """Differentiate position and orientation of a link by each joint position.
+
+    Args:
+        mechanism: Links and joints.
+        places: Positions and orientations of the links.
+        name: Name of the link.
+        offset: Point of the link, in the link's frame, m.
+
+    Returns:
+        Velocity of the point, m/rad (m/m for a slide), and angular velocity of the link, rad/rad,
+        for unit velocities of the joints. Both are (3, joints), in the order of
+        :func:`moving_joints`.
+    """
     joints, point = moving_joints(mechanism), places[name].point(offset)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
     while (joint := mechanism.link(name).joint) is not None:
@@ -80,16 +92,18 @@ def rank_of(values: FloatArray) -> int:
 def require_sound(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
     """Refuse a mechanism unless its three motors move the platform in pure translation.
 
+    Redundant closure equations are allowed; the TPM has one.
+
     Args:
         mechanism: Links, joints and closures.
         joints: Position of each joint by name, rad or m.
 
     Raises:
-        ConfigurationError: If a name is missing or not unique, a link comes before its parent, a
-            loop is open at these joint positions, the platform turns, or the motors, or
-            motors and platform together, do not have exactly three degrees of freedom. Redundant
-            closure equations are allowed; the TPM has one. Or if a joint or a solid is of an
-            unknown kind, an axis has not length 1, or a solid has no positive size.
+        ConfigurationError: If a name is missing or not unique; if a link has no mass, or comes
+            before its parent; if a joint or a solid is of an unknown kind; if an axis does not have
+            length 1; if a solid has no positive size; if a loop is open at these joint positions;
+            if the platform turns; or if the motors do not have exactly three degrees of freedom,
+            alone or together with the platform.
         SingularityError: If the rank of the closures' Jacobian is uncertain at these positions.
     """
     _require_parts(mechanism)

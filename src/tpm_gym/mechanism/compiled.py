@@ -22,7 +22,9 @@ from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
 ASSEMBLY_LIMIT = 0.010
-"""Distance of P from the forward kinematics above which the assembly mode is another one, m."""
+"""Largest distance between P and the forward kinematics of the joint positions, m.
+
+At a larger distance, the robot has left its assembly mode."""
 
 
 @dataclass(frozen=True, kw_only=True)

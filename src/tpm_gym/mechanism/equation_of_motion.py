@@ -33,15 +33,16 @@ class Energy(NamedTuple):
 
 
 class Formulas(NamedTuple):
-    """Functions of one mechanism, for a geometry, a configuration and constants of the bodies.
+    """Functions of one mechanism, each given as (arguments) -> result.
 
     Attributes:
-        build: Mechanism of a geometry.
-        inertia_of: Constants of bodies and a geometry, with the mass ``platform``.
-        torques: Torques for a configuration, rates, their changes, gravity and constants.
-        masses: Upper triangle of M, by rows, for a configuration, J and constants.
-        velocity: Rows of J of a configuration.
-        potential: Potential energy (J) for a configuration, gravity and constants.
+        build: (geometry) -> mechanism.
+        inertia_of: (bodies, geometry) -> constants of the dynamics. Their attribute ``platform`` is
+            the mass at P, kg.
+        torques: (configuration, rates, changes of the rates, gravity, constants) -> torques, N m.
+        masses: (configuration, Jacobian, constants) -> upper triangle of M, by rows, kg m^2.
+        velocity: (configuration) -> rows of the Jacobian, m/rad.
+        potential: (configuration, gravity, constants) -> potential energy, J.
     """
 
     build: Callable[[Any], Mechanism]
@@ -71,8 +72,8 @@ class EquationOfMotion(ABC):
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If a mass or gravity is not possible. If the number of factors is wrong,
-            at the first use.
+        ConfigurationError: If a mass or gravity is not possible. A wrong number of factors is
+            found at the first use.
     """
 
     geometry: Any
@@ -159,7 +160,7 @@ class EquationOfMotion(ABC):
 
     @abstractmethod
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Any, Numbers, Numbers]:
-        """Assemble the mechanism; return whether it is real, and whether it is regular."""
+        """Return the configuration at theta, whether it is real, and whether J exists there."""
 
     @abstractmethod
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:

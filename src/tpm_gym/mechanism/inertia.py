@@ -70,7 +70,7 @@ class Bodies:
     """Moving links by name, with factors of their masses; remembers which links were used."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Set factors of mass and inertia, one for each moving link; none if all are 1.
+        """Set factors of mass and inertia, one for each moving link; empty if all are 1.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.
@@ -109,7 +109,7 @@ class Bodies:
         return self.mass(name), self.moment(name, axis)
 
     def bar(self, name: str, along: int, about: int, length: float) -> FloatArray:
-        """Compute a, b, c (see the module), kg, of a bar that turns in a plane about ``about``."""
+        """Compute a, b, c (kg, see the module) of a bar that turns only about axis ``about``."""
         self._require_on_axis(name, [k for k in (X, Y, Z) if k not in (along, about)])
         share = float(self._link(name).centre_of_mass[along]) / length
         mass, turning = self.mass(name), self.moment(name, about) / length**2
@@ -117,7 +117,7 @@ class Bodies:
         return np.array([near, mass * share * (1 - share) - turning, far])
 
     def round_bar(self, name: str, along: int, length: float) -> FloatArray:
-        """Compute a, b, c (see the module), kg, of a bar that turns in space; it must be round."""
+        """Compute a, b, c (kg, see the module) of a round bar, which may turn about any axis."""
         one, other = (k for k in (X, Y, Z) if k != along)
         self._require_on_axis(name, [one, other])
         moments = self._link(name).inertia

@@ -86,8 +86,8 @@ class Machine(ABC):
         name: Name of the machine in messages.
         mount: Mount of the machine's frame in the world.
         region: Box in which environments keep point P, machine's frame, m.
-        goal_region: Box of positions of P for goals, and for objects on the table. Sampling keeps
-            to the part with ``safe_conditioning``.
+        goal_region: Box of positions of P for goals, and for objects on the table. Positions with
+            a conditioning below ``safe_conditioning`` are not sampled.
         home: Position of P at the start of an episode, machine's frame, m.
         step_limit: Largest change of the command for P along x, y, z in 40 ms, m.
         joint_limit: Largest change of a joint's command in 40 ms, rad (m for a slide).
@@ -187,8 +187,8 @@ class Machine(ABC):
         Args:
             position: Point P (..., 3) m.
             built: Parameters (b, k) of b machines from :meth:`built`; None for the nominal machine.
-                Of m rows, row i belongs to machine ``built[i // (m // b)]``; so points (n, K, 3) go
-                with parameters (n, k).
+                Of m points, point i belongs to machine ``built[i // (m // b)]``. For b machines
+                with q points each, pass points (b, q, 3).
         """
 
     @abstractmethod
@@ -204,7 +204,7 @@ class Machine(ABC):
     def mode_left(
         self, theta: ArrayLike, position: ArrayLike, built: FloatArray | None = None
     ) -> NDArray[np.int8]:
-        """Find the mode that a machine has left with joints at ``theta`` and P at ``position``.
+        """Find the mode that a machine has left, from its joint positions and the position of P.
 
         Returns:
             (...,): 0 for none. 1 for the assembly mode: the machine passed a parallel singularity,

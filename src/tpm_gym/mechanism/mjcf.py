@@ -45,7 +45,7 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
     """Build a root element with links, joints and closures, without motors or surroundings.
 
     Bodies, joints and colours have the names of the mechanism's links, joints and colours. Closures
-    have the names of their joints, and geoms that collide the name of their link.
+    have the names of their joints. Geoms that collide have the name of their link.
 
     Args:
         mechanism: Robot.
@@ -83,7 +83,7 @@ def site_names(closure: str) -> tuple[str, str]:
 
 
 def mjcf_text(machine: Machine) -> str:
-    """Write the robot over a table, with servos as motors, for use in MuJoCo alone."""
+    """Write the robot over a table, with servos as motors, for MuJoCo without tpm_gym."""
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))

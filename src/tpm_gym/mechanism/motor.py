@@ -40,7 +40,7 @@ class Motor:
         ring: Thickness of the rotor's ring, iron and magnets, m.
         stator_radius: Radius of the housing, m.
         end_turns: Length of winding and housing beyond the iron at each end, m.
-        clearance: Distance between the middle and the nearer end of each housing, m.
+        clearance: Distance from the middle of the motor to the near end of each half, m.
     """
 
     peak_torque: float
@@ -65,7 +65,7 @@ class Motor:
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
     def rotor(self, axis: Axis) -> list[Solid]:
-        """Build the rotor: steel rings along ``axis`` about the origin (magnets weigh as much)."""
+        """Build the rotor: rings along ``axis`` about the origin; magnets are as dense as steel."""
         size = (self.gap_radius, self.length / 2, 0.0)
         bore = (self.gap_radius - self.ring, self.length / 2, 0.0)
         return [

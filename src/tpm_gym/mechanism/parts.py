@@ -14,7 +14,7 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 CARBON_FIBRE = 1600.0  # kg/m^3
 SLIDES: Final = ("platform_x", "platform_y", "platform_z")
 TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-"""Joints of :func:`free_platform`: slides, whose positions are P (m), and turns, always 0 rad."""
+"""Revolutes of :func:`free_platform`, always at 0 rad; its SLIDES are at P, m."""
 FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 
@@ -100,7 +100,7 @@ def arm(axis: Literal["x", "y"], across: Literal["x", "y"], length: float) -> tu
 
 
 def free_platform(solids: tuple[Solid, ...], reach: float) -> list[Link]:
-    """Build a platform with its origin at P that belongs to no leg.
+    """Build a platform that belongs to no leg; its origin is P.
 
     Three slides and three revolutes, with almost no mass between them, let it move freely. So every
     leg can end in loop closures, and every closure connects two branches of the tree. PyBullet's

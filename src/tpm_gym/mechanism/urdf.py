@@ -165,7 +165,7 @@ def _add_solid(link: Element, tag: str, solid: Solid) -> Element:
 
 
 def _rpy(solid: Solid) -> Vector:
-    """Return roll, pitch and yaw of a box, or of a cylinder along z, in its link, rad."""
+    """Return roll, pitch and yaw (rad) of a solid in its link; cylinders in URDF are along z."""
     turn = solid.rotation
     pitch = math.asin(max(-1.0, min(1.0, -turn[2, 0])))
     if abs(turn[2, 0]) > 1 - 1e-12:  # roll and yaw turn about one axis: roll is set to 0

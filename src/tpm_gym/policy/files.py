@@ -103,8 +103,9 @@ class Weights(_Entries):
 class Description(_Entries):
     """Everything about a policy except its weights.
 
-    ``env_options`` are machine, engine, drive and shield of the training if they differ from the
-    id's. ``seed`` is None if it is not known. A version is None if the package was not installed.
+    ``env_options`` are machine, engine, drive and shield of the training; those left out are the
+    defaults of the environment id. ``seed`` is None if it is not known. A version is None if the
+    package was not installed.
     """
 
     format: Literal["tpm_gym.policy"]

@@ -121,7 +121,7 @@ class Policy:
         increments and joint increments have equal spaces. The machine may differ.
 
         Args:
-            env: Environment of Gymnasium, wrapped or not, or a vector of Gymnasium or of
+            env: Environment of Gymnasium, wrapped or not, or vector environment of Gymnasium or of
                 Stable-Baselines3.
 
         Raises:

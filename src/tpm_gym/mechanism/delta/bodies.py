@@ -37,7 +37,7 @@ class Inertia(NamedTuple):
     Attributes:
         motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
         weights: For each leg, mass at B_i minus ``couples``, kg.
-        couples: For each leg, b of the two bars B_iC_i, kg.
+        couples: For each leg, sum of the constants b of its two rods B_iC_i, kg.
         platform: Mass at P, kg.
         fixed: For each leg, moment of inertia of its crosses about the axis of their swing, kg m^2.
         spin: For each leg, moment of inertia of the rods about their own axes, over l4^2, kg.

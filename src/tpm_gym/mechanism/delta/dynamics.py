@@ -2,12 +2,16 @@
 
     torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
 
-Model of the masses, exact for the bodies of :mod:`tpm_gym.mechanism.delta.bodies`: arms turn about
-the motors' axes; each rod is a bar between B_i and C_i, two coupled points
-(:mod:`tpm_gym.mechanism.inertia`), and turns about its own axis as it swings; crosses swing with
-their rods; platform, cup (its slide at rest) and payload translate as P does. Forces of inertia and
-weight at B_i and P give the forces in the rods by one linear system of three (the rods are its
-columns), and these give the torques.
+The model of the masses is exact for the bodies of :mod:`tpm_gym.mechanism.delta.bodies`:
+
+* arms turn about the motors' axes;
+* a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points
+  (:mod:`tpm_gym.mechanism.inertia`). It also turns about its own axis as it swings;
+* crosses swing with their rods;
+* platform, cup (its slide at rest) and payload translate as P does.
+
+Forces of inertia and weight act at B_i and P. Three linear equations, with the rods as columns,
+give the forces in the rods. The forces in the rods give the torques.
 
 Units are SI. In the base's frame, gravity points along +z, as the base hangs upside down.
 """
@@ -59,7 +63,7 @@ class _Leg(NamedTuple):
 
 
 def legs(pose: Pose, m: Inertia) -> tuple[_Leg, _Leg, _Leg]:
-    """Collect what belongs to each leg."""
+    """Collect arm, rod and constants of each leg."""
     (c1, c2, c3), (s1, s2, s3), (r1, r2, r3) = pose.cos, pose.sin, pose.rods
     return (
         _Leg(c1, s1, r1, m.motors[0], m.weights[0], m.couples[0], Swing(m.fixed[0], m.spin[0])),
@@ -119,7 +123,7 @@ def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Nu
     a1, b1, c1 = inwards(ONE, a), inwards(ONE, b), inwards(ONE, c)
     a2, b2, c2 = inwards(TWO, a), inwards(TWO, b), inwards(TWO, c)
     a3, b3, c3 = inwards(THREE, a), inwards(THREE, b), inwards(THREE, c)
-    # For each leg and motor: what couples P with the elbow, and the rate of the swing
+    # For each leg and motor: coupling of P with the elbow, and rate of the swing
     k1a, k1b, k1c = _along(one, a1), _along(one, b1), _along(one, c1)
     k2a, k2b, k2c = _along(two, a2), _along(two, b2), _along(two, c2)
     k3a, k3b, k3c = _along(three, a3), _along(three, b3), _along(three, c3)
@@ -186,7 +190,7 @@ def _inertial(
 
 
 def _along(leg: _Leg, v: Triple) -> Numbers:
-    """Compute the couple times dB_i/dtheta_i . v."""
+    """Compute ``couple`` times the dot product of dB_i/dtheta_i and v."""
     return leg.couple * (leg.cos * v[2] - leg.sin * v[0])
 
 

@@ -1,9 +1,9 @@
 """Closed-form equations of the Delta, for floats, arrays and tensors.
 
-Three legs stand at 0, 120 and 240 degrees about z. In the frame of a leg, x points outwards, z from
-the base to the platform, and the arm turns about -y: at theta = 0 it points outwards, at a quarter
-turn to the platform. The platform only translates, so each leg keeps P on a sphere of radius l4
-about the elbow B_i, moved inwards by l2.
+Three legs stand at 0, 120 and 240 degrees about z. In the frame of a leg, x points outwards, and z
+points from the base to the platform. The arm turns about -y: it points along x at theta = 0, and
+along z at theta = pi/2. The platform only translates. So each leg keeps P on a sphere of radius l4,
+whose centre is the elbow B_i displaced inwards by l2.
 
 * Forward kinematics: P is one of the two points where three spheres intersect.
 * Inverse kinematics: the elbow is one of the two points where a circle and a sphere intersect.
@@ -167,7 +167,7 @@ def resolve(pose: Pose, h: Triple) -> Triple:
 
 
 def velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
-    """Compute the rows of J, v = J theta', m/rad; it exists at serial singularities too."""
+    """Compute the rows of J (v = J theta'), m/rad; J exists at serial singularities too."""
     one, two, three = pose.bars
     a, b, c = cross(two, three), cross(three, one), cross(one, two)
     p, q, r = pose.serial

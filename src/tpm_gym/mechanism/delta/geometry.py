@@ -1,4 +1,4 @@
-"""Five lengths that define a Delta, validated, and its modes."""
+"""Five lengths that define a Delta, with their checks, and the modes of a Delta."""
 
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -21,7 +21,7 @@ class DeltaLengths(NamedTuple):
 
 @dataclass(frozen=True)
 class DeltaGeometry:
-    """Lengths of a Delta, m, with the numbers of the paper's mechanism for the same parts.
+    """Lengths of a Delta, m, numbered as the same parts of the paper's mechanism.
 
     Attributes:
         l1: Radius of the base: distance from O to each actuated pivot A_i.
@@ -66,11 +66,11 @@ WORKING_MODES: Final[tuple[Triple, ...]] = tuple(
 """Eight working modes: for each leg, the sign of B_iC_i . dB_i/dtheta_i; 1 if the elbow is out."""
 ELBOWS_OUT: Final[Triple] = (1.0, 1.0, 1.0)
 ASSEMBLY_MODES: Final = (-1.0, 1.0)
-"""Two assembly modes: the sign of det A, the volume of the rods; 1 if P is below the elbows."""
+"""Two assembly modes: the sign of det A, which is 1 if P is below the elbows."""
 
 
 def require_delta(geometry: object) -> None:
-    """Raise InputError if the argument holds no lengths of a Delta, such as those of a TPM."""
+    """Raise InputError if the argument does not hold the lengths of a Delta."""
     if not isinstance(geometry, AnyDelta):
         raise InputError("geometry", geometry, "a DeltaGeometry")
 
@@ -79,7 +79,7 @@ def require_bends(bends: object) -> Triple:
     """Return three signs as a member of WORKING_MODES.
 
     Raises:
-        InputError: If they are no signs, 1 or -1.
+        InputError: If ``bends`` is not three numbers that are 1 or -1.
     """
     one, two, three = vector("bends", bends)  # type: ignore[arg-type]
     if (one, two, three) not in WORKING_MODES:
@@ -95,8 +95,8 @@ def require_side(side: object) -> None:
 
 IRB_360 = DeltaGeometry(l1=0.164, l2=0.044, l3=0.524, l4=1.244, l5=0.050)
 """ABB's FlexPicker IRB 360-1/1600, with the lengths that R. L. Williams II gives in "The Delta
-Parallel Robot: Kinematics Solutions" (Ohio University, 2016): triangles of base and platform with
-sides of 0.567 and 0.076 m, whose inner and outer radii are l1 and l2; arms of 0.524 m, and rods of
-1.244 m. Programs that others wrote after this paper have the same numbers, for example
-giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. l5 is ours: with the paper's 65.5 mm
-the ball joints of our rods would touch on the platform."""
+Parallel Robot: Kinematics Solutions" (Ohio University, 2016). The base is a triangle with sides of
+0.567 m and the inner radius l1. The platform is a triangle with sides of 0.076 m and the outer
+radius l2. Arms have 0.524 m, and rods 1.244 m. Programs that others wrote after his paper have the
+same numbers, for example giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. l5 is ours:
+with his 65.5 mm, the ball joints of our rods would touch on the platform."""

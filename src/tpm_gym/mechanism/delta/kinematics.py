@@ -43,12 +43,13 @@ from tpm_gym.mechanism.delta.geometry import (
 
 
 class Factors(NamedTuple):
-    """Factors that are zero at the singularities of a kind.
+    """Factors without a unit; each is zero at the singularities of its kind.
 
     Attributes:
-        parallel: (...,) det A over l4^3: the rods are parallel to one plane, or P is.
-        serial: (..., 3) B_iC_i . dB_i/dtheta_i over l3 l4: a leg is stretched or folded.
-        constraint: (...,) volume of the normals of the parallelograms, over l4^3.
+        parallel: (...,) det A over l4^3; zero where the rods are parallel to one plane.
+        serial: (..., 3) B_iC_i . dB_i/dtheta_i over l3 l4; zero where a leg is stretched or folded.
+        constraint: (...,) volume that the normals of the parallelograms span, over l4^3; zero
+            where the normals are parallel to one plane.
     """
 
     parallel: FloatArray
@@ -179,7 +180,7 @@ def no_assembly(
 
 
 def _regular(pose: Pose, regular: Numbers, ns: Namespace) -> Pose:
-    """Replace det A where J does not exist, or the derivatives by the lengths would be NaN."""
+    """Set det A to 1 where J does not exist; else the derivatives by the lengths would be NaN."""
     return pose._replace(parallel=ns.where(regular, pose.parallel, 1.0))
 
 

@@ -1,17 +1,17 @@
 """The mechanism from a Geometry: links, joints, inertias and loop closures.
 
-A physics engine for trees needs the loops cut. The spanning tree here follows the paper's
-numbering of links (Fig. 1):
+Some physics engines need a tree of links, so the loops are cut. This is the spanning tree, with
+the paper's numbers of links (Fig. 1):
 
     base 0 - arm 2  - two rods 4                                        (branch I, the 4S rods)
-    base 0 - arm 5  - rod 6 - link 3' - link 7 - platform 1 - end link 10   (branch II and on)
+    base 0 - arm 5  - rod 6 - link 3' - link 7 - platform 1 - end link 10   (branch II, platform)
     base 0 - arm 12 - end link 9 - two rods 11                          (branch III)
 
-and four ball joints close it again: the far ends of rods 4 on link 3', the far ends of rods 11 on
-end link 10. A rod with a ball at both ends could spin about its own axis. So rods 4 have a
-universal joint at the arm instead. Rods 11 turn on the paper's revolutes R_e and R_f. R_g and R_h
-are closed as balls, since revolutes would add redundant constraints. So end link 10, a straight bar
-through both balls, can roll about its own axis.
+Four ball joints close the loops. They connect the far ends of rods 4 to link 3', and the far ends
+of rods 11 to end link 10. A rod with a ball joint at both ends could spin about its own axis. So
+rods 4 have a universal joint at the arm instead. Rods 11 turn on the paper's revolutes R_e and R_f.
+R_g and R_h are ball joints here, since revolutes would add redundant constraints. So end link 10, a
+straight bar through both of them, can roll about its own axis.
 
 All frames are parallel to the paper frame when all joints are at zero: arms and rods then point
 along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
@@ -197,7 +197,7 @@ def joint_arrays(
 def rotated_joint_angles(
     theta: ArrayLike, branch: RotatedMode, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints with link 3' turned, rad, on a branch of the second mode.
+    """Compute the angles of all joints, rad, on a branch of the rotated operation mode.
 
     Raises:
         InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
@@ -213,7 +213,7 @@ def rotated_joint_angles(
 
 
 def rotated_joint_arrays(postures: RotatedPostures) -> dict[str, FloatArray]:
-    """Compute the angles (...,) of all joints in postures (...,) with link 3' turned, rad."""
+    """Compute the angles (...,) rad of all joints in postures (...,) of the rotated mode."""
     one, two, three = np.moveaxis(postures.theta, -1, 0)
     rods = [(x, y, z) for x, y, z in np.moveaxis(postures.rods, (-2, -1), (0, 1))]
     return _by_joint((one, two, three), rods, postures.beta, postures.geometry, postures.tilt)

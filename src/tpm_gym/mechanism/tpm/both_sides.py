@@ -31,7 +31,8 @@ class BothSides(TPM):
     """TPM that may change to the mirror image of its assembly mode.
 
     Its region is symmetric about y = 0. Forward kinematics, Jacobian and ``home`` belong to its
-    ``assembly_mode``. Functions of a position use the assembly mode of its side of y = 0.
+    ``assembly_mode``. Functions of a position use the assembly mode of the side of y = 0 on which
+    the position lies.
     """
 
     mirror_axis: ClassVar[int] = 1
@@ -72,11 +73,11 @@ class BothSides(TPM):
 def both_sides(machine: Machine) -> BothSides:
     """Return a TPM that works on both sides of y = 0.
 
-    Its region is the smallest box around the machine's region and the mirror image of that.
+    Its region is the smallest box around the region of ``machine`` and the region's mirror image.
 
     Raises:
         ConfigurationError: If the machine is no TPM, or not in its modes in the whole region.
-        UnreachableError: If a corner of the region, or next to the plane, cannot be reached.
+        UnreachableError: If a corner of the region, or a point next to y = 0, cannot be reached.
     """
     if not isinstance(machine, TPM):
         valid = "'paper', 'wide' or another tpm_gym TPM: no singularity divides its region in two"

@@ -2,18 +2,19 @@
 
     torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
 
-The coupling degree is zero, so every point has a formula, and so have its velocity and
-acceleration. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and
-then of P from the accelerations of B_i, each by one division (:func:`_resolve`). Forces of inertia
-and weight at B_i, C1 and P give the forces in the rods, one division each, and these give the
-torques of the motors (:func:`gather`). Bodies enter by sixteen constants
+The coupling degree is zero, so there are formulas for position, velocity and acceleration of every
+point. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and then of P
+from the accelerations of B_i, each by one division (:func:`_resolve`). Forces of inertia and weight
+at B_i, C1 and P give the forces in the rods, each by one division. The forces in the rods give the
+torques of the motors (:func:`gather`). Sixteen constants describe the bodies
 (:mod:`tpm_gym.mechanism.tpm.inertia`):
 
 * the arms turn about the motors' axes;
-* rods are bars between B_i and C_i, two coupled points each. Rods 4 and 11 turn about their own
-  axes as they swing; the inertia of the swing contains that, the crosses and end link 9;
+* a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points. Rods 4 and 11
+  also turn about their own axes as they swing. The inertia of the swing contains this turning, the
+  crosses of rods 4, and end link 9;
 * link 3' translates in the plane y = 0, as C1 does;
-* link 7 turns about z, a bar between C1 and P but for constant offsets;
+* link 7 turns about z. It is a bar between C1 and P, except for constant offsets;
 * platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
   roll about its own axis, which does not change the motors' torques and is left out.
 
@@ -48,11 +49,12 @@ class Pose(NamedTuple):
     Attributes:
         cos: l3 cos(theta_i), m.
         sin: l3 sin(theta_i), m.
-        found: Assembly.
+        found: P, C1 and the direction of link 7.
         rods: Vectors B_iC_i, m.
         factors: Factors of the Jacobians' determinants.
-        per_planar: 1 / planar, 1/m^2. Divisions take longest, so each divisor is inverted once.
-        per_k: 1 / k, with k = sin(beta) times level3, the determinant of loop 2, 1/m.
+        per_planar: 1 / ``factors.planar``, 1/m^2. Divisions take longest, so each divisor is
+            inverted once.
+        per_k: 1 / (``factors.sin_beta`` ``factors.level3``), 1/m.
         lengths: Link lengths, m.
     """
 
@@ -212,9 +214,13 @@ def accelerations(
 
 
 def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
-    """Solve r_i . a_i = h_i for the motion of C1 along x and z, and of P along link 7's turn.
+    """Solve B_iC_i . a_i = h_i for the motion of C1 and the turn of link 7.
 
-    The a_i are velocities or accelerations of C_i.
+    Here a_i is the velocity of C_i, or its acceleration (of C_3 without the centripetal part).
+
+    Returns:
+        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z, and l7 times the rate of
+        beta or the change of this rate.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     x, z = (r2z * h1 - r1z * h2) * pose.per_planar, (r1x * h2 - r2x * h1) * pose.per_planar

@@ -13,12 +13,12 @@ from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, Z, three
 
 
 class Inertia(NamedTuple):
-    """Constants of the dynamics; :mod:`tpm_gym.mechanism.inertia` defines b and swings.
+    """Constants of the dynamics; :mod:`tpm_gym.mechanism.inertia` defines b and :class:`Swing`.
 
     Attributes:
         motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
         weights: For each leg, mass at B_i minus ``couples``, kg.
-        couples: For each leg, b of the bars B_iC_i, kg.
+        couples: For each leg, sum of the constants b of its rods B_iC_i, kg.
         link3: Mass at C1, kg.
         link7: b of link 7, kg.
         platform: Mass at P, kg.

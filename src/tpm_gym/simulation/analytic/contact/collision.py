@@ -86,7 +86,10 @@ def _inner(box: _Box, a: float, b: float, c: float) -> Vector:
 def _add(
     contacts: Records, place: _Place, pair: _Pair, arms: Frame, normal: Vector, gap: float
 ) -> int:
-    """Write a contact with the first two of ``arms``; return the new number of contacts."""
+    """Write a contact; return the new number of contacts.
+
+    The first two rows of ``arms`` become ``arm_a`` and ``arm_b``; the third row is not used.
+    """
     contact = contacts[place[0]]
     contact["slot"] = place[1]
     (contact["a"], contact["b"]), contact["friction"] = pair
@@ -355,9 +358,9 @@ def _collide_boxes(
 
 @compiled
 def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
-    """Return the vectors (m) from both centres to the nearest points of two edges, and zero.
+    """Return the vectors (m) from both centres to the nearest points of two edges.
 
-    The edges are parallel to axis i of ``one`` and to axis j of ``two``.
+    The edges are parallel to axis i of ``one`` and to axis j of ``two``. A third vector is zero.
     """
     a, b, (p, q) = one.middle, two.middle, (one.frame[i], two.frame[j])
     for k in range(3):
@@ -385,10 +388,10 @@ def _clip_face(
     place: _Place,
     pair: _Pair,
 ) -> int:
-    """Add contacts at the corners of the overlap of a box's face and the face opposite to it.
+    """Add contacts at the corners of the overlap of two faces that face each other.
 
-    The normal of the face is axis ``face`` of ``plane``. ``sign`` is 1 if ``plane`` is body a of
-    the pair, and -1 if it is body b.
+    They are a face of ``plane``, whose normal is axis ``face``, and a face of ``other``. ``sign``
+    is 1 if ``plane`` is body a of the pair, and -1 if it is body b.
     """
     away, facing = plus(other.middle, plane.middle, -1.0), 0
     normal = plus(_ZERO, plane.frame[face], math.copysign(1.0, dot(plane.frame[face], away)))

@@ -20,7 +20,7 @@ _EMPTY = 1e-3  # Pa; a smaller vacuum is set to zero
 
 
 class Way(NamedTuple):
-    """Point P before the last time step, now, and after the time step (m, world)."""
+    """Point P before the previous time step, before this one, and after this one (m, world)."""
 
     before: Vector
     now: Vector
