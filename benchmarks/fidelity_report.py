@@ -36,11 +36,13 @@ COLUMNS = (
     "gap mean", "99.9 %", "max", "FK 99.9 %", "max", "near y = 0", "tilt max", "track max",
 )  # fmt: skip
 LEGEND = (
-    "Gap (largest of the four closures), FK (platform against forward kinematics of the encoders; "
-    "where 1/cond(J) > 0.05, and below that: near y = 0) and tracking (platform against its "
-    "reference) in mm, tilt in degrees; over every time step of all three motions. Cost is the CPU "
-    "time of stepSimulation and the motor commands, the robot alone; the ratio is of control "
-    "periods, against the default in the same round."
+    "Gap is the largest gap of the four closures. FK is the distance of the platform from the "
+    "forward kinematics of the encoders where 1/cond(J) > 0.05; near y = 0 is the largest such "
+    "distance where 1/cond(J) is smaller. Track is the distance of the platform from its "
+    "reference. These columns are in mm, tilt is in degrees. All are over every time step of the "
+    "three motions. Cost is the CPU time of stepSimulation and the motor commands, with the robot "
+    "alone in the scene. The ratio compares the cost of a control period with that of the default "
+    "in the same round of timing."
 )
 
 

@@ -137,8 +137,8 @@ def test_limits_leave_parts_of_sets_and_of_aspects():
 def test_the_figures_page_says_what_the_limits_leave():
     """It has percentages of the elbows-out mode, and of its regions with z_C1 > z_B1."""
     text = " ".join((ROOT / "docs" / "figures.md").read_text(encoding="utf-8").split())
-    said = re.search(r"stops leave (\d+)% of it.* and (\d+)% once no two links", text)
-    dark = re.search(r"leave (\d+)% of the largest, (\d+)% of the other dark region", text)
+    said = re.search(r"(\d+)% of it lies within the motors' stops, and (\d+)% if also no", text)
+    dark = re.search(r"lie (\d+)% of the largest aspect, (\d+)% of the dark orange one", text)
     assert said
     assert dark
     left = []
