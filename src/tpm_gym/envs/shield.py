@@ -85,7 +85,7 @@ class Shield:
 
     Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
     control, increments of the joints with joint control. They are measured from the command to
-    which the control converts the action. No safe command is nearer by more than about 0.001.
+    which the control converts the action. No safe command is nearer by more than 0.003.
 
     Args:
         machine: Nominal machine.

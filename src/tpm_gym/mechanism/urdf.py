@@ -25,7 +25,7 @@ _CLOSING = """
   "home"), and in joint_positions(theta) of tpm_gym's machine, for any angles of the motors.
 
   PyBullet: a point-to-point constraint for each pair; erp=1, and 300 iterations of its own solver,
-  or more. Its direct ones lose loops within one body (docs/fidelity.md), which this is.
+  or more. Its direct ones lose loops within one body (docs/loops.md), which this is.
   """
 
 COLOURS = {

@@ -17,7 +17,7 @@ from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.worker import Worker
 
 _PADDED: Any = {"min": {"pad": 0.1}, "max": {"pad": 0.1}}
-"""Range of an axis: that of the curves and a tenth more. Without it, curves lie on the edge at 0."""
+"""Range of an axis: that of the curves, and a tenth more at each end."""
 _COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118ab2")
 _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1

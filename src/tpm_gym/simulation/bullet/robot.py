@@ -2,7 +2,7 @@
 
 Each leg of the spanning tree is loaded as a separate multibody, so that every loop closure joins
 two multibodies. With a closure inside one multibody, Bullet's direct solvers compute wrong forces
-and the loop opens at once; between multibodies they are exact (docs/fidelity.md). Separate
+and the loop opens at once; between multibodies they are exact (docs/loops.md). Separate
 multibodies also make the solver's rows shorter.
 """
 
