@@ -102,7 +102,7 @@ def in_world(
         quaternion: (n, k, 4), orientations of the objects, world.
         left: (n,) mode that each robot has left now: 1 assembly, 2 working.
         mode_left: (n,) mode that each robot left first; overwritten.
-        gap: (n,) m, largest gap of each robot; open if larger than ``limit``, or NaN.
+        gap: (n,) m, largest gap of each robot. If it is above ``limit`` or NaN, a loop is open.
         limit: Largest allowed gap, m.
         turn: (3,) factors (1 or -1) of the machine's axes in the world frame.
         origin: (3,) m, origin of the machine's frame in the world frame.
@@ -150,7 +150,7 @@ def measured(
     halves: FloatArray,
     most: float,
 ) -> FloatArray:
-    """Return the measurements of encoders, camera and vacuum gauge: robot and k objects.
+    """Return measurements of n robots and their k objects by encoders, camera and vacuum gauge.
 
     Args:
         position: (n, 3) m, point P.
@@ -161,7 +161,7 @@ def measured(
         velocities: (n, k, 3) m/s.
         held: (n,) index of the object in the cup; -1 for none.
         vacuum: (n,) Pa.
-        lip: (3,) m, from the lip of the cup to P.
+        lip: (3,) m, vector from the lip of the cup to P.
         halves: (k,) m, half heights of the objects.
         most: Largest vacuum, Pa.
 
@@ -279,11 +279,11 @@ def friction_force(
     moments: Vector,
     step: float,
 ) -> tuple[Vector, Vector]:
-    """Compute Coulomb's friction on a block for the next time step, from the slip in the last.
+    """Compute Coulomb's friction on a block for the next time step, from the slip in the last one.
 
-    The force has two parts. The first part would end the slip in one time step. The second part
-    holds a block that sticks, at which there is no slip: each time step adds half of the first part
-    to it.
+    The force has two parts. The first part would end the slip in one time step, and is zero without
+    slip. The second part holds a block that sticks. Each time step adds half of the first part to
+    the second part.
 
     Args:
         point: Point of contact, m.
@@ -349,7 +349,7 @@ def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray
 
     Args:
         shares: (r, k, d, 4) random numbers in [0, 1). The first three are the place in a box. The
-            fourth chooses the box; all d candidates are in the box that the first one chooses.
+            fourth number of the first candidate chooses the box of all d candidates.
         boxes: (b, 2, 3) low and high corners: all boxes of the first point, then of the second.
         counts: (k,) number of boxes of each point.
     """
@@ -531,9 +531,9 @@ def along(
 def braced_inverse(
     mass: FloatArray, stiffness: FloatArray, damping: float, step: float
 ) -> FloatArray:
-    """Return the inverse (n, 6) of mass + step (step stiffness + damping) for each row.
+    """Return the inverse (n, 6) of mass + step * (step * stiffness + damping) for each robot.
 
-    The columns are the upper triangle of the inverse, by rows.
+    The six columns are the entries 00, 01, 02, 11, 12 and 22 of the symmetric inverse.
     """
     inverse = np.empty((len(mass), 6))
     for row in range(len(mass)):

@@ -147,7 +147,7 @@ class Path:
     stays in their convex hull, and has finite accelerations.
 
     Point P is interpolated, not the joint positions: near a singularity, interpolated joint
-    positions would move P away from the line by centimetres.
+    positions would move P away from its path by centimetres.
 
     Args:
         machine: Nominal machine, used for the inverse kinematics.

@@ -1,4 +1,4 @@
-"""Pictures of a scene: cameras, the image of an engine, goal markers, and tiles of images."""
+"""Pictures of a scene: cameras, images that an engine draws, goal markers, and tiles of images."""
 
 from __future__ import annotations
 
@@ -94,14 +94,18 @@ class Camera:
         return eye
 
     def following(self, point_p: FloatArray) -> Camera:
-        """Return the camera with its target in the world frame, for point P (3,) m."""
+        """Return the camera with its target in the world frame.
+
+        Args:
+            point_p: (3,) m, place of point P, to which the target may be relative.
+        """
         if not self.follows:
             return self
         return replace(self, target=tuple((self.target + point_p).tolist()), follows=False)
 
 
 def camera_of(value: Any, machine: Machine) -> Camera:
-    """Return a camera: one of :data:`CAMERAS` for this machine, a Camera, or a mapping of one.
+    """Return a camera from a name in :data:`CAMERAS`, a Camera, or a mapping of its attributes.
 
     Raises:
         ConfigurationError: If ``value`` is none of these.
@@ -140,7 +144,8 @@ class View(NamedTuple):
         camera: Camera, in the world frame.
         width: Width, pixels.
         height: Height, pixels.
-        segmented: Whether the ids of bodies are wanted, and a depth whose edges are theirs.
+        segmented: Whether the picture includes the ids of bodies. The depth then has the edges of
+            these bodies; otherwise its edges may be smoothed.
     """
 
     camera: Camera
@@ -188,7 +193,7 @@ def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
     Args:
         picture: Picture with a depth; its colours are changed.
         view: View of the picture.
-        casters: (k, 4) m: position of each body, world, and its radius.
+        casters: (k, 4) m: x, y, z (world) and radius of each body.
     """
     if picture.depth is None:
         return
@@ -232,7 +237,10 @@ def _paint_sphere(
     radius: float,
     focal: float,
 ) -> None:
-    """Blend a sphere at ``place`` (camera's axes, m) into the pixels of rays (u, v, 1)."""
+    """Blend a sphere at ``place`` (camera's axes, m) into the pixels of ``area``.
+
+    ``rays`` are the coordinates of these pixels, from :func:`_rays`.
+    """
     u, v = rays
     square, along = u * u + v * v + 1, u * place[0] + v * place[1] + place[2]
     apart = np.sqrt(np.maximum(place @ place - along**2 / square, 0.0))  # of ray and centre, m
@@ -264,7 +272,7 @@ def _area(view: View, point: FloatArray, radius: float) -> tuple[slice, slice]:
 
 
 def _rays(view: View, rows: slice, columns: slice) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return u (1, c) to the right and v (r, 1) up, at a depth of 1, of pixels in an area."""
+    """Return coordinates of an area's pixels at a depth of 1: u (1, c) right and v (r, 1) up."""
     u = (np.arange(view.width)[columns] + 0.5 - view.width / 2) / view.focal_length
     v = (view.height / 2 - np.arange(view.height)[rows] - 0.5) / view.focal_length
     return u[None, :], v[:, None]
@@ -275,7 +283,8 @@ def tile(frames: Sequence[NDArray[Any]], columns: int | None = None) -> NDArray[
 
     Args:
         frames: Images.
-        columns: Images in a row; None for about as many as rows. Places that are left over are 0.
+        columns: Number of images in a row; None for about as many columns as rows. Empty places
+            are filled with 0.
     """
     columns = columns or math.ceil(math.sqrt(len(frames)))
     rows = -(-len(frames) // columns)

@@ -59,8 +59,8 @@ class Plant:
         length_errors: True minus nominal lengths (l1 to l7), m; empty if all errors are zero.
 
     Raises:
-        ConfigurationError: If a value is not finite, a factor or the friction is negative, or
-            there are not three values for three motors.
+        ConfigurationError: If a value is not finite, a factor or the friction is negative, or an
+            attribute with one value for each motor does not have three values.
     """
 
     link_masses: tuple[float, ...] = ()
@@ -124,9 +124,10 @@ class Randomisation:
             rebuild the robot at each reset, which makes a reset several times slower. PyBullet
             leaks about 13 kB of memory per rebuild.
 
-    If the plant is not nominal, actions at full speed towards the corner near y = 0 can move the
-    platform through the singularity. The State reports this. With random actions and length errors
-    of 1 mm it happens in a few of 100 episodes; heavy links and weak motors make it more frequent.
+    If the plant is not nominal, actions at full speed towards a corner of the region near y = 0
+    can move the platform through the singularity. The State reports this. With random actions and
+    length errors of 1 mm, this happens in a few out of 100 episodes. Heavy links and weak motors
+    make it more frequent.
 
     Raises:
         ConfigurationError: If a value is out of range.

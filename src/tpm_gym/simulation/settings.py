@@ -15,7 +15,9 @@ _SHORTEST = 1e-6  # s; a control step with a shorter time step would take minute
 
 
 def settings_of(kind: type[T], name: str, value: Any) -> T:
-    """Convert a ``kind``, a mapping of its fields, or None (the defaults) into a ``kind``.
+    """Convert an instance of ``kind``, a mapping of its fields, or None to an instance.
+
+    None gives the defaults.
 
     Raises:
         ConfigurationError: If ``value`` is none of these, has unknown keys, or is out of range.

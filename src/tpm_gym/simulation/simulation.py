@@ -33,8 +33,10 @@ CLOSURE_LIMIT = 0.005
 _STEPS = 10  # time steps in a control period other than 40 ms, if the settings have none
 
 _BLUR = 0.05
-"""Distance from the plane of ``mirror_axis``, as a fraction of the machine's step limit, at which
-the observed velocity normal to the plane is half of J theta_dot."""
+"""Distance from the plane of ``mirror_axis``, as a fraction of the machine's step limit.
+
+At this distance, the observed velocity normal to the plane is half the velocity from J theta_dot.
+"""
 
 _COLUMNS = (
     *("commands", "noise", "position", "jacobian", "conditioning", "mode_left", "bias"),
@@ -158,7 +160,7 @@ class Simulation:
             ConfigurationError: If a plant needs servo drives, but the drives are ideal, or a speed
                 is given for a scene without a belt.
             InputError: If theta or a position is not three finite numbers, or the scene has no
-                object of a name; no robot has moved then.
+                object with a name in ``objects``; no robot has moved then.
             UnreachableError: If a robot cannot be assembled at theta; no robot has moved then.
             JointLimitError: If a motor is beyond a stop at theta; no robot has moved then.
         """
@@ -395,7 +397,7 @@ class Simulation:
         return picture
 
     def _casters(self, row: int) -> list[list[float]]:
-        """Return position and radius of all bodies with a shadow, cup and objects, (k, 4) m."""
+        """Return position and radius, (k, 4) m, of the bodies with a shadow: cup and objects."""
         now = self.state()
         x, y, z = now.platform_position[row].tolist()
         widths = [block.width / 2 for block in self.scene.objects]

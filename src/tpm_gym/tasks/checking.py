@@ -17,7 +17,10 @@ from tpm_gym.tasks.task import Task
 __all__ = ["check"]
 
 _EXAMPLES = 7
-"""States with which a task is checked; no other size is 7, so that axes cannot be confused."""
+"""Number of states with which a task is checked.
+
+No other axis has a length of 7, so that an axis of states cannot be confused with another axis.
+"""
 _OWN_ROW = (
     "equal results for equal states: from the robot's own row (reduce by axis=-1), and in every "
     "call (store nothing in the task)"
@@ -27,9 +30,10 @@ _OWN_ROW = (
 def check(task: Task, taken: Sequence[str] = ()) -> None:
     """Check that a task can start, and computes equal results for states in a batch and alone.
 
-    A task cannot start if the machine has no tempting goals, or no room for the task. A method that
-    reduces over the robots (``np.linalg.norm(x)`` without ``axis=-1``), or takes rows for columns,
-    gives wrong rewards in vector environments without an error.
+    A task cannot start if the machine has no room for it, or has no tempting goals (just above the
+    threshold of safe conditioning) although ``goals`` is ``"tempting"``. A method that reduces over
+    the robots (``np.linalg.norm(x)`` without ``axis=-1``), or confuses rows with columns, gives
+    wrong rewards in vector environments without an error.
 
     Args:
         taken: Names that no event may have.

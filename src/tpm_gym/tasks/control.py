@@ -31,7 +31,7 @@ class Control(Protocol):
     """Conversion between actions and commands, for n robots.
 
     Attributes:
-        name: Name in the environment's option.
+        name: Value of the environment's option ``control`` that selects this control.
     """
 
     name: str
@@ -139,7 +139,7 @@ class JointControl:
         share: FloatArray,
         excess: FloatArray,
     ) -> FloatArray:
-        """Shorten the increment until P moves by the limit, to a thousandth; return P (r, 3) m.
+        """Shorten the increment so that P moves by almost the step limit; return P (r, 3) m.
 
         ``excess`` is the displacement at ``share``. The secant through two tries gives the next
         try. (Dividing by the excess alone converges slowly next to the serial singularity, where P
@@ -198,7 +198,7 @@ class Follower:
     :data:`USABLE` of its motors' peak torques.
 
     Args:
-        machine: Machine; its payload counts.
+        machine: Machine. The torques include its payload.
         acceleration: (3,) m/s^2, largest acceleration of the command along each axis.
         braking: (3,) m/s^2, deceleration with which commands stop at an end of the region.
         period: Control period, s.

@@ -45,8 +45,8 @@ class Conveyor(Task):
     The belt runs along x, at 0.05 to 0.20 m/s, drawn for each episode. The block comes within reach
     in the first second. The camera shows it 3 control steps late, in the observation and in the
     achieved goal. The goal lies in the tray, on the table beyond the belt. With
-    ``goals="tempting"``, a part of the block's way on the belt, and of the tray at the goal's y, is
-    only just safe.
+    ``goals="tempting"``, a part of the block's way on the belt is only just safe, and so is a part
+    of the line along x through the goal in the tray.
     """
 
     block = Block()
@@ -202,7 +202,7 @@ class _Camera:
         return self.motion.machine.mount.rotate(way)
 
     def place(self) -> FloatArray:
-        """Return the block's centre (3,) m now, world: as in the picture, moved by the belt."""
+        """Return the block's present centre (3,) m, world: in the picture plus the belt's way."""
         steps = len(self._trail) - 1
         if self._seen("velocity")[0] > self.motion.seen["belt_speed"][0] / 2:
             steps = self._task.camera_delay

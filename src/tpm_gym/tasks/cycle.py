@@ -23,7 +23,7 @@ __all__ = ["Cycle"]
 
 STROKE: Final = 0.305
 RISE: Final = 0.025
-"""Way along x, and way up at either end, m."""
+"""Lengths of the way: along x (STROKE), and up and down at its ends (RISE), m."""
 BLEND: Final = 0.050
 """Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
 
@@ -36,15 +36,15 @@ PAYLOAD: Final = 0.1
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
 """Largest RMS torque of the plan, as a share of the peak torque; 2% are a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Accelerations of the command along x, y, z, as shares of those along one axis at peak torque."""
+"""Accelerations along x, y, z, divided by the acceleration at peak torque along one axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
-Along x the way ends close to the end of the region, along z far from it. The motors must be able
-to brake along both at a time.
+The way ends close to the end of the region along x, but far from the end of the region along z. The
+motors must be able to brake along x and z at the same time.
 """
 NEAR: Final = 0.010
-"""Distance to the goal, m, from which on the extra term of a dense reward stays at -1."""
+"""Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
 """Depth of P below the gate at which the reward term is -1 in each step, m."""
 POINTS: Final = 120
@@ -187,7 +187,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Add to a dense reward minus the distance up to 10 mm, in units of 10 mm."""
+        """Return the base class's term; if dense, subtract the gap over 10 mm, at most 1."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 
@@ -199,7 +199,7 @@ class Cycle(Task):
         return {"gate": np.minimum(-below / UNIT, 0.0)}
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Follow the gate as fast as the motors can without overheating if they repeat it."""
+        """Follow the gate at the highest speed that the motors can repeat without overheating."""
         start, goal = motion.command, self.machine.mount.to_paper(motion.goal)
         path = self.gate(start[1], backwards=bool(start[0] > goal[0]))
         times, _ = timed(self.machine, path, CONTINUOUS * self._peak, USABLE * self._peak)

@@ -33,7 +33,7 @@ class Expert:
 
     Raises:
         InputError: If ``env`` is no such environment.
-        ConfigurationError: If its task has no plan, on the first action.
+        ConfigurationError: If its task has no plan; :meth:`reset` and :meth:`act` raise this.
     """
 
     def __init__(self, env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> None:

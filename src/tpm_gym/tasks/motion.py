@@ -1,4 +1,4 @@
-"""Building blocks of plans: the view of one robot, and moves of point P."""
+"""Building blocks of plans: the observation of one robot, and moves of point P."""
 
 from __future__ import annotations
 
@@ -21,13 +21,16 @@ __all__ = ["Motion", "Move", "hanging"]
 RAMP = 0.120
 """Time from rest to full speed, s."""
 ROUNDING = 1e-5
-"""Tolerance as a fraction of a control step, above the error of single precision, 1e-6."""
+"""Tolerance for rounding errors, as a fraction of a control step.
+
+It is larger than the error of single precision, 1e-6.
+"""
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
 SLOW_ABOVE = CUP.seal_gap + 0.001
-"""Height of the lip over a block below which a gentle pick moves slowly, m."""
+"""Height of the lip over a block, m; a gentle pick moves slowly below this height."""
 SLOW_SPEED = 0.025
-"""Speed of a gentle pick below that height, m/s."""
+"""Speed of a gentle pick below ``SLOW_ABOVE``, m/s."""
 
 
 def hanging(block: Block) -> FloatArray:
@@ -43,7 +46,9 @@ class Move(NamedTuple):
 
 
 class Motion:
-    """View of a robot for a plan, and moves with trapezoidal speed.
+    """Observation of one robot for its plan, and methods that yield moves of point P.
+
+    The speed of a move rises, holds and falls (see :meth:`trapezoid`).
 
     Attributes:
         machine: The machine that moves.
@@ -142,9 +147,10 @@ class Motion:
             yield Move(target() + (1 - down) * above - (1 - done) * way, bool(down > 0))
 
     def _overlapped(self, ways: list[FloatArray]) -> FloatArray:
-        """Return fractions (n, k) of k ways, each begun while the one before slows down.
+        """Return the done fraction of each of k ways after each of n control steps, (n, k).
 
-        The sum of their speeds never exceeds the speed of one way.
+        Each way begins while the way before it slows down. The sum of the speeds of these two ways
+        does not exceed the largest speed of one way.
         """
         lengths = np.array([len(way) for way in ways])
         begins = np.cumsum([0, *np.maximum(lengths[:-1] - self._ramp + 1, 0)])

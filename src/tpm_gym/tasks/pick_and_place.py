@@ -22,7 +22,7 @@ CLEARANCE = 0.028
 It is no multiple of the tolerance, so that rounding errors do not decide about success.
 """
 RELEASE_HEIGHT = 0.0005
-"""Height over its place on the table to which the expert carries the block, m.
+"""Height over a goal on the table, m, to which the expert carries the block to release it.
 
 The weight stretches the cup by 0.4 to 0.5 mm, so that the block is let go just above the table.
 A block that is pressed on the table has forces of friction that each engine computes differently

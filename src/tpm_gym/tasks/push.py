@@ -19,10 +19,10 @@ from tpm_gym.tasks.task import Entry, Task, dense
 __all__ = ["Push"]
 
 CLEARANCE: Final = 0.008
-"""Height of the lip over the block on arrival, and gap between both as it comes down, m."""
+"""Height of the lip over the block on arrival; gap from lip to face as the lip comes down, m."""
 SHORTEST: Final = 0.060
 LONGEST: Final = 0.240
-"""Smallest and largest displacement of the block along the normal of the pushed face, m."""
+"""Bounds (SHORTEST, LONGEST) of the block's displacement along the pushed face's normal, m."""
 SLOPE: Final = 0.10
 """Largest tangent of the angle between the block's path and the normal of the pushed face."""
 PACE: Final = 0.014
@@ -32,7 +32,7 @@ SIDEWAYS: Final = 0.15
 CLOSE: Final = 0.001
 """Remaining distance to the goal at which the expert stops, m."""
 UPRIGHT: Final = math.cos(math.radians(45))
-"""Smallest z of the axis of a block that stands."""
+"""Smallest z of a standing block's axis, the unit vector from its centre to its top."""
 
 _ATTEMPTS: Final = 1000
 _DRAWS: Final = 8

@@ -4,8 +4,9 @@ A careless policy that moves to a tempting goal comes too near to the singularit
 P between safe points are safe (the safe set is convex; a test draws pairs). So with Cartesian
 actions the risk is at the ends: the goal and an object's start are just above the threshold, and
 nearly half of the sphere around the goal is unsafe. With joint actions the risk is on the way too:
-the line in joint space from start to goal is unsafe, often all the way. Every pair has both
-properties, so that all ids have the same goals.
+the line in joint space from start to goal is unsafe, often all the way. Every tempting pair of
+start and goal has both risks, so that environments with Cartesian actions and with joint actions
+have the same goals.
 
 All points are positions of P, in the machine's frame, m. Every function takes one generator for
 each row, and a row draws from its own generator only.
@@ -39,10 +40,13 @@ __all__ = [
 APART: Final = 0.030
 """Smallest distance from start to goal, m, so that no episode starts with success."""
 BAND: Final = 0.004
-"""Largest excess of a tempting end's conditioning over the threshold; less than 1 mm of y."""
+"""Largest excess of a tempting end's conditioning over the threshold.
 
-_DRAWS: Final = 4  # points a call, so that nearly every row needs one call only
-_BATCH: Final = 256  # near the singularity, where one point of some 30 fits
+Along y, this excess is a distance of less than 1 mm.
+"""
+
+_DRAWS: Final = 4  # points in a call; nearly every row then needs only one call
+_BATCH: Final = 256  # points in a call near the singularity, where about one of 30 fits
 _ATTEMPTS: Final = 100
 _FRACTIONS: Final = np.linspace(0.0, 1.0, 33)
 
@@ -60,16 +64,16 @@ def safe_points(
     Args:
         rngs: One for each of r rows.
         machine: Machine that defines the safe points.
-        regions: For each name, the region of its point, or equally likely ones.
+        regions: For each name, the region of its point, or several regions that are equally likely.
         known: Points (3,) or (r, 3) m that are not drawn, by name.
         apart: Smallest distance, m.
-        near_singularity: Whether the points are just above the threshold.
+        near_singularity: Whether the points must be just above the threshold of safe conditioning.
 
     Returns:
         The known and the drawn points, (r, 3) m each.
 
     Raises:
-        ConfigurationError: If no draw is safe, far enough, and near the singularity if it has to.
+        ConfigurationError: If no draw meets these conditions.
     """
     names = [*known, *(name for name in regions if name not in known)]
     first, rows = len(known), np.arange(len(rngs))
@@ -112,8 +116,9 @@ def safe_draw(
         rng: Generator of the row.
         machine: The machine.
         goals: ``"tempting"`` if a part of the way shall be only just safe.
-        draw: Draw of d points (d, 3) at a time.
-        ways: Ends (d, k, 3) m, machine's frame, of straight parts of the points' ways.
+        draw: Function that draws d points (d, 3).
+        ways: Function of these points. It returns the ends (d, k, 3) m, machine's frame, of the
+            straight parts of their ways.
 
     Raises:
         ConfigurationError: If no draw has such a way.
@@ -185,9 +190,9 @@ def _tempting(
 
 
 def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatArray:
-    """Compute the conditioning (33, ...) along lines in joint space between points (..., 3).
+    """Compute the conditioning at 33 places on each line in joint space, (33, ...).
 
-    It is 0 where the machine cannot be assembled.
+    The lines join points (..., 3). The conditioning is 0 where the machine cannot be assembled.
     """
     first, last = machine.require_inverse(np.stack(np.broadcast_arrays(start, end)))
     fractions = _FRACTIONS.reshape(-1, *(1,) * first.ndim)

@@ -82,13 +82,13 @@ class Task(ABC):
         tolerance: Distance below which a goal is achieved, m.
         samplings: Values of ``goals``.
         controls: Names of the controls that can perform the task.
-        events: Names of methods of the task. ``info`` has their results for the state, (n,) bool,
-            and an evaluation the share of episodes in which each was true after a step.
+        events: Names of methods of the task that return (n,) bool for a state. ``info`` has the
+            results. An evaluation reports the share of episodes in which each was ever true.
         control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
             scaled to this time. In shorter periods commands can ask for more torque than the motors
             have, unless :attr:`accelerations` are set; a shield requires them then.
-        accelerations: Largest acceleration of the command for P along x, y, z, machine's frame,
-            and its deceleration before the ends of the region, m/s^2; None for any.
+        accelerations: Limits of the command's acceleration, and of its deceleration before the
+            ends of the region, along x, y, z, machine's frame, m/s^2; None for no limits.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         camera_delay: Control steps by which observation and achieved goal show objects late.
         entries: Entries of the observation vector, in order.
@@ -193,13 +193,13 @@ class Task(ABC):
     def achieved(self, state: State) -> FloatArray:
         """Return the achieved goal, (n, goal_size) m: the objects' centres, or P without objects.
 
-        P is that of the forward kinematics of the encoders.
+        P is computed by forward kinematics from the encoder readings.
         """
         places = state.object_position
         return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Yield the moves of the expert for one robot; the last move is kept.
+        """Yield the expert's moves for one robot; after the last move, the expert repeats it.
 
         Raises:
             ConfigurationError: If the task has no plan.
@@ -241,7 +241,7 @@ class Task(ABC):
         return {"goal": goal, "singularity": singularity, **self.shaping(state)}
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the one term that depends on the goal, (...,), for a gap (...,) m; NaN fails."""
+        """Return the reward's goal term, (...,), for a gap (...,) m; if sparse, NaN gives -1."""
         if self.reward == "sparse":
             missed: FloatArray = np.subtract(gap < self.tolerance, 1.0)
             return missed
@@ -292,8 +292,8 @@ class Task(ABC):
             As :meth:`sample`.
 
         Raises:
-            ResetOptionError: If an option is unknown, is no such array of finite numbers, or would
-                put an object into another or into the robot.
+            ResetOptionError: If an option is unknown, is not a finite array of the right shape, or
+                would put an object into another object or into the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
             ConfigurationError: If the result of :meth:`sample` is wrong.
         """
@@ -463,7 +463,7 @@ class Task(ABC):
         return (*entries, Entry(f"{name}_turn", "-", meaning, (0.0, 0.0), (1.0, 1.0), source))
 
     def _measure(self, state: State) -> FloatArray:
-        """Return the measurements of robot and objects, (n, 9 + 12 k)."""
+        """Return the measurements (n, 9 + 12 k): 9 of the robot, and 12 of each of k objects."""
         plain = np.ascontiguousarray
         values: FloatArray = loops().measured(
             state.fk_position, state.fk_velocity, state.command, plain(state.object_position),
@@ -509,7 +509,7 @@ class Task(ABC):
         """Invert :meth:`observe`: name -> (..., k) in SI units.
 
         Raises:
-            InputError: If it is no array of numbers of this length; pixel observations are shorter.
+            InputError: If ``observation`` is not an array of numbers (..., observation_size).
         """
         vector = numbers("observation", observation)
         if vector.shape[-1:] != (self.observation_size,):
@@ -577,6 +577,6 @@ def _range(low: ArrayLike, high: ArrayLike) -> str:
 
 
 def _boxes(points: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of upright blocks (r, 3) m, 1 um inside, so that blocks may touch."""
+    """Return low and high corners (r, 3) m of upright blocks, 1 um smaller: blocks may touch."""
     half = np.array(block.half) - 1e-6
     return points - half, points + half

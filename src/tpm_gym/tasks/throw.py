@@ -21,7 +21,7 @@ __all__ = ["Throw"]
 
 NEAREST: Final = 0.040
 FARTHEST: Final = 0.150
-"""Limits of the distance of goals from the end of the region, along x, m."""
+"""Bounds (NEAREST, FARTHEST) of the distance of goals from the region's end along x, m."""
 CLEARANCE: Final = 0.028
 """Height of the cup over the block before and after the expert picks it, m."""
 DROP: Final = 0.003
@@ -29,15 +29,15 @@ DROP: Final = 0.003
 BRAKING: Final = 0.050
 """Distance from the place of release to the end of the region, within which P stops, m."""
 RUN_UP: Final = (1 / 3, 2 / 3, 1.0, 1.0, 1.0)
-"""Steps of the command in the run-up, in units of the last step, in which the cup lets go.
+"""Lengths of the command's steps in the run-up, as shares of the last step.
 
-The path is a spline of three commands. So the three equal steps give a control period of constant
-speed.
+The last step switches the vacuum off. The path is a spline of three commands, so that with three
+equal steps the speed is constant in the last two control periods, until the cup lets go.
 """
 VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / Task.control_period
 """Time from the command to let go until the block is free, in control periods."""
 AHEAD: Final = 1.5 - VENTED
-"""Distance from the place of release to the command of its control period, in units of the step.
+"""Distance from the place of release to the last command of the run-up, in units of the last step.
 
 The spline lags the commands by half a period.
 """

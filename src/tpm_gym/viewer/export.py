@@ -20,7 +20,7 @@ _ENV: Final = "TPMPickAndPlace-v0"
 _HOLD: Final = 0.8
 """Time for which the first and the last posture stay, s."""
 _OURS: Final = "__VISER_EMBED_DATA__="
-"""Text of a page that viser wrote."""
+"""Text in every page that viser wrote; a page without this text is not replaced."""
 
 
 def export(folder: str | Path, machine: str | Machine = "paper", seed: int = 2) -> Path:

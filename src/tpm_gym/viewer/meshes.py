@@ -24,7 +24,7 @@ _STEPS = 200  # points along each edge of a slice
 
 
 class Mesh(NamedTuple):
-    """Vertices (v, 3) m and triangles (f, 3) of their indices."""
+    """Vertices (v, 3) m, and triangles (f, 3): each is the indices of three vertices."""
 
     vertices: FloatArray
     faces: NDArray[np.int64]
@@ -79,9 +79,10 @@ def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> Fl
 
 
 def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """Return the points P (m, a, b, 3) to which link 7 turns from the factor's curves of point C1.
+    """Return the points P (m, a, b, 3) of the surface on which a factor is zero.
 
-    Points of other working modes are NaN.
+    The factor depends on point C1 alone, and is zero on curves of C1. For each C1 on these curves,
+    link 7 turns P through a half circle. Points of other working modes are NaN.
     """
     x, z, p, q = (part[..., None] for part in sheets.curves(factor, mode, g))
     beta = np.linspace(-np.pi / 2, np.pi / 2, _AROUND)
@@ -138,7 +139,9 @@ def grid_mesh(points: FloatArray) -> Mesh:
 def slice_mesh(
     middle: Vector, reach: float, quality: Callable[[FloatArray], FloatArray]
 ) -> tuple[Mesh, FloatArray]:
-    """Return the part of a square parallel to xz where a quality is positive, and its values.
+    """Return the mesh of a square parallel to xz, and the quality at the mesh's vertices.
+
+    The mesh has only the part of the square where the quality is positive.
 
     Args:
         middle: Middle of the square, m.

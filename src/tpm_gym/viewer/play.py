@@ -195,7 +195,10 @@ class Play:
     def _draw(
         self, place: int, title: str, names: tuple[str, ...], rows: Sequence[Any], length: int
     ) -> None:
-        """Draw curves. Keep one plot for each set of names, because pages may still update it."""
+        """Show the curves in the plot of their names, and hide the other plots.
+
+        The other plots are not removed, because a page may still have to process updates of them.
+        """
         key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
         plots = self._plots[place]
         for other, plot in plots.items():

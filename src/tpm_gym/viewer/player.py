@@ -48,7 +48,10 @@ def policies_for(env_id: str) -> tuple[str, ...]:
 
 
 def _require_id(env_id: str) -> None:
-    """Refuse other ids: a page can ask for ``module:id``, and Gymnasium would import the module."""
+    """Raise if an id is not one of this package.
+
+    A page can send ``module:id``, and Gymnasium would import the module.
+    """
     if env_id not in env_ids():
         raise ConfigurationError("env", env_id, ", ".join(env_ids()))
 

@@ -134,7 +134,12 @@ class RobotScene:
         )
 
     def draw_objects(self, state: State, markers: FloatArray) -> None:
-        """Move objects to their places in the state of one robot, and markers (k, 3) m, world."""
+        """Move the objects and the goal markers.
+
+        Args:
+            state: State of one robot, with the poses of the objects.
+            markers: Places of the goal markers, (k, 3) m, world.
+        """
         for index, node in enumerate(self._objects):
             node.position = state.object_position[index]
             node.wxyz = _first(state.object_quaternion[index])

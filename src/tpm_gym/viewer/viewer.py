@@ -20,7 +20,7 @@ from tpm_gym.viewer.worker import Worker
 
 
 class Viewer:
-    """Page with a robot that can be dragged, and that plays episodes.
+    """Page on which a user drags a robot and plays episodes.
 
     :func:`tpm_gym.viewer.open_viewer` explains the arguments.
 

@@ -36,7 +36,10 @@ class Worker:
             self._change.notify_all()
 
     def ask(self, name: str, job: Job) -> None:
-        """Run a job for a user's input; ignore an update that a job of this thread caused."""
+        """Run a job because a user changed a control.
+
+        Do nothing if a job of this thread has changed the control.
+        """
         if threading.current_thread() is not self._thread:
             self.put(name, job)
 

@@ -2,9 +2,10 @@
 
 The mechanism has coupling degree zero, so every quantity is a closed-form function of point P. With
 ideal drives, P follows its spline. Then one evaluation of inverse kinematics, Jacobian and dynamics
-computes the whole control period, at any time step. Joint velocities and accelerations are
-differences over time steps, as in the other engines. Servo drives, and ideal drives that would
-exceed a motor's largest torque, are simulated by forward dynamics, one time step after another.
+computes the whole control period, whatever the length of a time step. Joint velocities and
+accelerations are differences over time steps, as in the other engines. Servo drives, and ideal
+drives that would exceed a motor's largest torque, are simulated by forward dynamics, one time step
+after another.
 
 The readings ``gap`` and ``tilt`` are always 0; use another engine to measure them.
 """
@@ -40,8 +41,9 @@ _CHECK_ABOVE = 0.5
 _NEAR_PLANE = 1.2
 """Distance from the plane of ``mirror_axis``, divided by the machine's step limit.
 
-Beyond this distance, torques are computed from differences of joint positions. At this distance,
-their error is 0.2 m/s^2 in the acceleration normal to the plane, at full speed.
+Beyond this distance, torques are computed from differences of joint positions. At this distance
+and at full speed, these differences have an error of 0.2 m/s^2 in P's acceleration normal to the
+plane.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -193,10 +195,10 @@ class AnalyticEngine:
             self._repeat(rows, start, path, vacuum)
 
     def _near_plane(self, axis: int, path: Path) -> BoolArray:
-        """Return whether P or its path is near the plane, or the path goes to its other side, (n,).
+        """Return whether P or its path is near the plane of ``mirror_axis`` or crosses it, (n,).
 
-        There, differences of the joint positions do not give the torques. True for all robots if
-        any robot has had encoder bias or length errors.
+        Near the plane, differences of the joint positions do not give the torques. The result is
+        True for all robots if any robot has had encoder bias or length errors.
         """
         if not self._exact:
             return np.ones(self._count, dtype=np.bool_)

@@ -25,7 +25,10 @@ Closer to the plane, the values at this distance are used. They change with the 
 distance, so the error is smaller than the rounding errors at the true distance.
 """
 _BESIDE: Final = 1e-4
-"""Distance of P, m, to two points whose joint positions give the second derivative at P."""
+"""Distance, m, from P to two points before and behind it on the line of its velocity.
+
+The joint positions at the three points give the second derivative of the joint positions at P.
+"""
 _COMPLIANCE: Final = 1e-8
 """Compliance of ideal motors, as a fraction of the trace of the inverse inertia at their axes.
 
@@ -48,10 +51,10 @@ class _Dynamics(NamedTuple):
 
 
 class _Lifted(NamedTuple):
-    """Kinematics at points that are moved to the side of the machine's home.
+    """Kinematics at points on that side of the plane on which the machine's home is.
 
     Attributes:
-        points: Mirrored points, at least _LIFT from the plane, (r, 3) m.
+        points: Points mirrored to this side, at least _LIFT away from the plane, (r, 3) m.
         side: 1, or -1 for the mirrored component, (r, 3).
         theta: Joint positions at ``points``, (r, 3) rad.
         own_rate: Inverse Jacobian K at ``points``, (r, 3, 3) rad/m, with theta_dot = K v.
@@ -127,7 +130,10 @@ def _dynamics(
 
 
 def _lifted(machine: Machine, built: FloatArray | None, position: FloatArray) -> _Lifted:
-    """Mirror points (r, 3) to the side of the machine's home, at least _LIFT from the plane."""
+    """Mirror points (r, 3) beyond the plane, and move points to a distance of at least _LIFT.
+
+    All points are then on that side of the plane on which the machine's home is.
+    """
     axis = machine.mirror_axis or 0
     home = np.sign(machine.home[axis])
     points, side, scale = position.copy(), np.ones_like(position), np.ones_like(position)

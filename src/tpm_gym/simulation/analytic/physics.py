@@ -18,10 +18,11 @@ class Physics(Numerics):
         time_step: Time step, s; the control period must have a whole number of time steps, 3 or
             more.
         torques: Time steps in which the torques of ideal motors are computed and compared with
-            their largest torques: ``"none"`` (no limit, and NaN in the State, except for robots
-            that need forward dynamics), ``"last"`` of a control period, or ``"every"``. With
-            ``"last"``, all time steps are computed if the last torque is above half of a motor's
-            largest torque. Servo drives always compute all torques.
+            their largest torques. ``"none"``: torques are not limited, and are NaN in the State.
+            ``"last"``: the last time step of a control period; if its torque is above half of a
+            motor's largest torque, all time steps. ``"every"``: all time steps. Torques are always
+            computed and limited in all time steps for servo drives, and for robots that need
+            forward dynamics.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -35,9 +35,9 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 _Course = tuple[Any, ...]
 """Attributes ``theta`` to ``carried`` of :class:`Course`."""
 _New = tuple[FloatArray, ...]
-"""Results at the end of a time step: joint positions, joint velocities and torques (r, 3), P
-predicted from the joint velocities and from its own velocity (2, r, 3) m, and acceleration of P due
-to the change of the joint velocities (r, 3) m/s^2."""
+"""Results at the end of a time step: joint positions, joint velocities and torques (r, 3); two
+predictions of P (2, r, 3) m, one from the joint velocities and one from the velocity of P; and the
+acceleration of P due to the change of the joint velocities, (r, 3) m/s^2."""
 
 
 @kept
@@ -235,8 +235,8 @@ def modes_left(
 def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
     """Compute the joint velocities u after an impulse, with Coulomb friction.
 
-    mass u = impulse - resistance. The resistance is limit sign(u), or at most limit if u is zero.
-    So u minimises u mass u / 2 - impulse u + limit |u|, summed over the joints.
+    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, its
+    size is at most limit. So u minimises u @ mass @ u / 2 - impulse @ u + limit @ |u|.
 
     Args:
         mass: Inertia, kg m^2.
@@ -261,7 +261,10 @@ def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
 
 @compiled
 def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> Vector:
-    """Solve mass u = impulse - limit signs for joints whose sign is not 0; the others stay at 0."""
+    """Solve mass @ u = impulse - limit * signs for the joints whose sign is not 0.
+
+    At the other joints, u is 0.
+    """
     (a, b, c, d, e, f), (p, q, r) = mass, (abs(signs[0]), abs(signs[1]), abs(signs[2]))
     own = a * p + 1 - p, b * p * q, c * p * r, d * q + 1 - q, e * q * r, f * r + 1 - r
     x, y, z = impulse
@@ -271,7 +274,7 @@ def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> V
 
 @compiled
 def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
-    """Find x within +-most that minimises x matrix x / 2 - wanted x.
+    """Find x from -``most`` to ``most`` that minimises x @ matrix @ x / 2 - wanted @ x.
 
     At the minimum, some entries are at a bound, and the cost is stationary in the others.
     """

@@ -21,7 +21,10 @@ _FASTEST = 2.5  # m/s, largest speed of lip towards object: twice the largest co
 
 
 class Grip(NamedTuple):
-    """Held object and vacuum, and the object's pose in the tool's inertial frame (None if none)."""
+    """Held object, vacuum, and the held object's pose in the tool's inertial frame.
+
+    The pose is None if no object is held.
+    """
 
     hold: Hold = EMPTY
     pose: Pose | None = None

@@ -8,16 +8,17 @@ lies on the cone, opposite to the slip. For a sticking contact, the limit along 
 cone and the last force along y, and vice versa. Without a last force, the box lies inside the cone.
 
 **Slides.** All points of a contact share these scales, and contacts between objects have none. So
-this module adds the friction that was missing in the last time step, as a force and a torque: mu N
-against the slip of each point, less the solver's friction.
+this module adds the friction that was missing in the last time step, as a force and a torque. This
+is mu N against the slip of each point, minus the solver's friction.
 
 **Upright faces.** The solver takes N from a solution without friction. But a block that the lip
-pushes leans on the lip only because the table brakes it. Without friction N is 0, and the lip would
-be as slippery as ice. So this module adds the missing friction as a force, from the last N.
+pushes leans on the lip only because the table brakes it. In a solution without friction N is 0, so
+the solver allows no friction at the lip. So this module computes the missing friction from the last
+N, and adds it as a force.
 
 Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
-by one time step. The smaller scale never falls below :data:`_LEAST`. Level contacts between objects
-keep the box where they stick, and all of them in the first time step of a slide.
+by one time step. The smaller scale never falls below :data:`_LEAST`. A level contact between two
+objects has the friction box while it sticks, and in the first time step of a slide.
 """
 
 from __future__ import annotations
@@ -47,7 +48,11 @@ _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction o
 _BOX = (1.0, 1.0)  # Bullet's default scales
 _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
-"""Sum of the forces that were added to a contact, and its largest friction at last, N."""
+"""Friction that was added to a contact in a time step, N.
+
+It is given as the second part of the force (see ``compiled.friction_force``), and the largest force
+that could be added.
+"""
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
 _Slip = tuple[float, float, float, float]
@@ -135,7 +140,7 @@ class Friction:
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
-        """Set the scales of all faces to an unknown direction of the force."""
+        """Set the scales of all faces to those for an unknown direction of the force."""
         self._pushes, self._lacks = {}, {}
         for face in (self._cup, *self._belts, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet
@@ -233,8 +238,9 @@ class Friction:
     ) -> None:
         """Scale the friction of a face, and add the friction that the last time step left out.
 
-        A blow lasts one time step, and in the next its friction is missing no more. The friction of
-        a slip that turns round is missing no more, either. So the smaller of two time steps counts.
+        The friction that is missing in one time step may not be missing in the next: a blow lasts
+        one time step, and a slip may reverse. So the smaller one of the values of the last two time
+        steps is added.
 
         Args:
             motion: Motion of the object.
@@ -260,7 +266,7 @@ class Friction:
     def _push(
         self, motion: _Motion, other: _Motion, at: Vector, force: Vector, torque: Vector = _ZERO
     ) -> None:
-        """Apply a force (N) at a point (m) and a torque (N m), and the reaction to the other."""
+        """Apply a force (N) at a point (m) and a torque (N m); ``other`` gets the reactions."""
         number, frame = self._number, pybullet.WORLD_FRAME
         for pushed, sign in ((motion, 1.0), (other, -1.0)):
             if pushed.free:
@@ -276,8 +282,9 @@ class Friction:
     ) -> None:
         """Apply the friction that the solver leaves out where an object's side is pushed.
 
-        The upright points count as one contact at the point with the largest force. A blow lasts
-        one time step, and pushes no more in the next. So the smaller of two time steps counts.
+        All contact points at upright faces are treated as one contact, at the point with the
+        largest force. A blow lasts only one time step. So the friction is limited to the smaller
+        one of the limits of the last two time steps.
 
         Args:
             motion: Motion of the object.
@@ -348,7 +355,7 @@ def _slip(motion: _Motion, other: _Motion, point: Any) -> _Slip:
 def _lack(
     motion: _Motion, slips: Sequence[_Slip], points: Sequence[Any], coefficient: float
 ) -> _Wrench:
-    """Compute Coulomb's friction of the points that slip, less the solver's.
+    """Compute Coulomb's friction of the points that slip, minus the solver's friction.
 
     Args:
         motion: Motion of the object.

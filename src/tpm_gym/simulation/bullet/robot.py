@@ -2,8 +2,8 @@
 
 Each leg of the spanning tree is loaded as a separate multibody, so that every loop closure joins
 two multibodies. With a closure inside one multibody, Bullet's direct solvers compute wrong forces
-and the loop opens at once; between multibodies they are exact (docs/loops.md). Separate
-multibodies also make the solver's rows shorter.
+and the loop opens at once. With closures between multibodies, the forces are exact
+(docs/loops.md). Separate multibodies also make the constraint rows of the solver shorter.
 """
 
 from __future__ import annotations
@@ -143,7 +143,10 @@ class Robot:
             self._client.resetJointState(*self.joints[name], angle, 0.0)
 
     def alter(self, mass_factors: Sequence[float], motor_strength: Sequence[float]) -> None:
-        """Scale the nominal masses of the moving links (empty: all 1) and the motors' torques."""
+        """Scale the nominal masses of the moving links, and the motors' largest torques.
+
+        If ``mass_factors`` is empty, all masses are nominal.
+        """
         factors = mass_factors or [1.0] * len(self._inertias)
         for (link, (mass, moments)), factor in zip(self._inertias.items(), factors, strict=True):
             inertia = [factor * moment for moment in moments]

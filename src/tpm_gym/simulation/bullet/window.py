@@ -68,7 +68,10 @@ class Window:
     def show(
         self, joints: Sequence[float], objects: Sequence[Pose], camera: Camera, markers: FloatArray
     ) -> None:
-        """Place the robot (rad, in the order of ``Robot.joints``), the objects and the markers."""
+        """Place the robot, the objects and the markers.
+
+        ``joints`` are the joint positions (rad) in the order of ``Robot.joints``.
+        """
         client, positions = self._client, iter(joints)
         if camera != self._aimed:  # else the user may move the camera
             self._aimed = camera

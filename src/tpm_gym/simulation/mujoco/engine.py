@@ -120,8 +120,8 @@ class MujocoEngine:
     def _reset(self) -> None:
         """Reset the state, and suppress MuJoCo's warnings.
 
-        MuJoCo writes the first warning of each kind to the console and into a file. An open loop
-        raises ClosureError anyway.
+        MuJoCo writes the first warning of each kind to the console and into a file. The warnings
+        are not needed, because a loop closure that opens raises ClosureError.
         """
         mujoco.mj_resetData(self.model, self.data)
         for warning in self.data.warning:

@@ -106,7 +106,7 @@ def _light(root: Element, world: Element) -> None:
 
 
 def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
-    """Add table, belt, paint and floor."""
+    """Add table, belt, painted rectangles and floor."""
     for slab, low, high in boards(machine.table, scene.belt):
         size = (high - low) / 2, machine.table[1], slab.half_height
         pos = (low + high) / 2, 0.0, slab.top - slab.half_height

@@ -17,7 +17,10 @@ from tpm_gym.simulation.display import has_display
 from tpm_gym.simulation.imaging import BACKGROUND, Camera, Picture, View, metres
 
 RENDERERS = ("egl", "osmesa", "glfw")
-"""OpenGL backends, in the order in which they are tried: on the GPU, the CPU, a display."""
+"""OpenGL backends in the order in which they are tried.
+
+They draw on the GPU, on the CPU, and on a display.
+"""
 
 _SMALL = 128 * 128  # pixels
 

@@ -31,7 +31,7 @@ class Robot:
     Args:
         model: Compiled model.
         data: State of the model.
-        machine: True machine of the model.
+        machine: Machine with the true lengths of the robot.
         ideal: Whether the motors have ideal drives; else they apply given torques.
 
     Attributes:
@@ -110,7 +110,7 @@ class Robot:
         self._set_targets((0.0,))
 
     def _set_targets(self, targets: Sequence[float]) -> None:
-        """Set the targets of ideal motors (rad), if any, and of the cup's slide (m, last)."""
+        """Set the targets of the ideal motors (rad), if any; the last is the cup's slide's (m)."""
         data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
         for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):

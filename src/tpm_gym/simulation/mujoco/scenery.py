@@ -42,9 +42,9 @@ class Scenery:
     def keep_sliding(self) -> None:
         """Prevent sliding objects from hopping; call between the two halves of a time step.
 
-        MuJoCo's contact model is convex. It separates two sliding bodies at a speed of friction
-        coefficient times slip speed. This method subtracts the corresponding acceleration from the
-        reference acceleration along the normal.
+        MuJoCo's contact model is convex. So two sliding bodies move apart along the normal; their
+        speed along the normal is the friction coefficient times the slip speed. This method
+        subtracts the corresponding acceleration from the reference acceleration along the normal.
         """
         data = self._data
         if not data.ncon:

@@ -14,7 +14,7 @@ from tpm_gym.viewer.kinds.tpm import TPMKind
 __all__ = ["KINDS", "Kind", "Posture", "find_kind"]
 
 KINDS: Final[dict[Any, type[Kind]]] = {Machine: Kind, TPM: TPMKind, Delta: DeltaKind}
-"""Kinds by the class of the machine; the row of the nearest base class counts."""
+"""Kinds by class of machine. A machine has the kind of its nearest base class in this table."""
 
 
 def find_kind(machine: Any) -> Kind:

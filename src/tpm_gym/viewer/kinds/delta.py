@@ -22,7 +22,10 @@ _SHAPE: Final = (96, 96, 96)
 
 
 class DeltaKind(Kind):
-    """A Delta. Working modes are tuples of signs; an assembly mode is the sign of det A."""
+    """A Delta.
+
+    Working modes are tuples of signs. Assembly modes are 1 (P below the elbows) and -1.
+    """
 
     lists: Mapping[str, str] = {
         "Operation": "The platform only translates",

@@ -94,11 +94,12 @@ class Kind:
     Attributes:
         machine: The machine.
         lists: Labels of the lists in the panel, with an explanation each. The first list chooses
-            the operation mode, the last one the assembly mode. Lists between, at most two, choose
-            the working mode.
-        working: Working modes by the entries chosen in the lists between.
+            the operation mode, and the last one the assembly mode. The lists between them, at most
+            two, choose the working mode.
+        working: Working modes by the entries that are chosen in the lists for the working mode.
         assembly: Assembly modes by operation mode and label.
-        lows: Lower ends of the sliders of three motors, degrees. For a slide, its stops count.
+        lows: Lower ends of the motors' sliders in the panel, degrees. The slider of a linear motor
+            goes from stop to stop instead.
     """
 
     lists: Mapping[str, str] = {"Operation": "Operation mode", "Assembly": "Assembly mode"}

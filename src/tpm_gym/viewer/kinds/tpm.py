@@ -115,7 +115,7 @@ class TPMKind(Kind):
         working: kinematics.WorkingMode,
         assembly: kinematics.AssemblyMode,
     ) -> Posture:
-        """Return the posture with link 3' parallel to x."""
+        """Return a posture of the translating operation mode: link 3' is parallel to x."""
         joints = bodies.joint_angles(theta, assembly, self.machine.geometry)
         quality = float(jacobian.conditioning(theta, assembly, self.machine.geometry))
         return Posture(self.machine, theta, place, working, assembly, joints, quality)
@@ -126,7 +126,7 @@ class TPMKind(Kind):
         working: kinematics.WorkingMode,
         mode: kinematics.RotatedMode,
     ) -> Posture:
-        """Return a posture with link 3' turned."""
+        """Return a posture of the rotated operation mode: link 3' is turned about y."""
         joints = {name: float(angle) for name, angle in bodies.rotated_joint_arrays(one).items()}
         sizes = np.linalg.svd(np.nan_to_num(rotated.velocity(one)[:3]), compute_uv=False)
         quality = float(sizes[2] / sizes[0]) if sizes[0] > 0 else 0.0

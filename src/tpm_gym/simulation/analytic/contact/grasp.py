@@ -104,7 +104,7 @@ def _seals(item: Record, lip: Vector, index: int, setting: Setting) -> bool:
 
 @compiled
 def _take(item: Record, cup: Record, point: Vector, lip: Vector, half: float) -> None:
-    """Hold an object at its position, lowered if it is closer to the lip than ``CLEARANCE``."""
+    """Hold an object where it is, but at least ``CLEARANCE`` below the lip."""
     position = three(item["position"])
     x, y, z = plus(position, point, -1.0)
     lower = max(CLEARANCE - (lip[2] - position[2] - half), 0.0)

@@ -183,8 +183,8 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
         count: Number of contacts.
         bodies: Bodies of the contacts; their velocities are changed.
         motor: Spring that drives body 0, the cup.
-        calm: Whether to stop as soon as all objects are :func:`still`. The impulses then balance
-            all forces.
+        calm: Whether to stop as soon as all objects are :func:`still`: the impulses balance all
+            forces at that moment.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
     for sweep in range(_SWEEPS):

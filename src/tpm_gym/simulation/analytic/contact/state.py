@@ -119,7 +119,9 @@ class Tables(NamedTuple):
 
 
 class Route(NamedTuple):
-    """Motion of point P in K time steps, for r robots; m, machine's frame, contiguous arrays.
+    """Motion of point P in K time steps, for r robots.
+
+    Points are in metres, in the machine's frame. The arrays are contiguous.
 
     Attributes:
         before: (r, 3), P one time step before the beginning.

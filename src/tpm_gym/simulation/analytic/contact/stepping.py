@@ -173,7 +173,10 @@ def _place(path: Route, i: int, setting: Setting, points: FloatArray) -> None:
 
 @compiled
 def _placed(point: Vector, turn: Vector, origin: Vector) -> Vector:
-    """Convert a point from the machine's frame to the world frame; with origin 0, a vector."""
+    """Convert a point from the machine's frame to the world frame.
+
+    With an ``origin`` of 0, the function converts a vector.
+    """
     return (
         turn[0] * point[0] + origin[0],
         turn[1] * point[1] + origin[1],
