@@ -169,7 +169,7 @@ LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
         Layers._aspects,
     ),
     "workspace": (
-        "Workspace", "Points that the working mode reaches, stops left out", Layers._workspace
+        "Workspace", "Points that the working mode reaches, ignoring the stops", Layers._workspace
     ),
     "region": (
         "Task region", "Box of the commands (black) and of the goals (green)", Layers._region
