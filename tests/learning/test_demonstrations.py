@@ -105,3 +105,4 @@ def test_returns_go_on_after_the_last_step():
     steps = [step(-1, False), step(-1, True), step(0, False), step(-2, True)]
     found = np.concatenate(_returns(steps, 0.5)).tolist()
     assert found == [-1 - 0.5 * 2, -2, 0 - 0.5 * 4, -4]
+    assert np.concatenate(_returns(steps, 1.0)).tolist() == [-2, -1, -2, -2]

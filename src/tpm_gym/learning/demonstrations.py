@@ -126,11 +126,12 @@ def _returns(steps: Sequence[_Step], gamma: float) -> list[NDArray[Any]]:
     """Return the discounted sum of rewards (n,) from each step on.
 
     The last reward of an episode is assumed to continue for ever, since only a time limit ends it.
+    Without discount, that sum would be infinite, and the last reward counts once.
     """
     found: list[NDArray[Any]] = []
     total = np.zeros(0)
     for step in reversed(steps):
-        last = step.rewards / (1 - gamma)
+        last = step.rewards / (1 - gamma if gamma < 1 else 1)
         total = last if step.ended.all() else step.rewards + gamma * total
         found.append(total)
     return found[::-1]
