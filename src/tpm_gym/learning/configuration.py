@@ -389,13 +389,18 @@ def _check_recipe(config: TrainingConfig) -> None:
             "normalised; raise it, or set normalize_advantage: false",
         )
     if config.recipe.hindsight:  # hindsight samples from whole episodes only
-        for name in ("learning_starts", "buffer_size"):
-            few, most = config.argument(name), config.argument(name) * envs // config.horizon
+        # A new episode deletes an earlier one from a full buffer, long before it is whole itself.
+        for name, count, episodes in (
+            ("learning_starts", 1, "an episode"),
+            ("buffer_size", 2, "two episodes"),
+        ):
+            least = count * config.horizon
+            few, most = config.argument(name), config.argument(name) * envs // least
             fewer = f", or give at most --envs {most}" if most else ""
             _refuse(
-                few < config.horizon,
-                f"{where}: {name}: {few} is less than the {config.horizon} steps of an episode in "
-                f"each of {envs} environments; raise it in a --recipe of yours{fewer}",
+                few < least,
+                f"{where}: {name}: {few} is less than the {least} steps of {episodes} in each of "
+                f"{envs} environments; raise it in a --recipe of yours{fewer}",
             )
 
 
