@@ -326,7 +326,7 @@ def test_demonstrations_are_as_many_as_asked_for(tmp_path):
     [
         *(
             ("sac", "buffer_size: 230", f"buffer_size: {size}", "buffer_size")
-            for size in (49, 10**12, 10**30)
+            for size in (49, 99, 10**12, 10**30)
         ),
         ("ppo", "batch_size: 20", "batch_size: 1", "batch_size: 1: advantages of one step cannot"),
         ("ppo", "n_steps: 40", "n_steps: 1", "n_steps: 1: advantages of one step cannot"),
@@ -418,6 +418,13 @@ def test_one_file_has_recipes_of_several_algorithms(tmp_path):
         ("HerReplayBuffer", "os.system", "replay_buffer_class: .*'HerReplayBuffer'"),
         ("policy: MultiInputPolicy", "", "policy: Field required"),
         ("replay_buffer_class: HerReplayBuffer", "", "replay_buffer_kwargs: no effect"),
+        (
+            "features_extractor_class: GoalGapExtractor",
+            "features_extractor_kwargs: {unit: 0.1}",
+            "features_extractor_kwargs: no effect",
+        ),
+        ("[8],", "{pi: [8]},", r"net_arch.*Field required \(qf\)"),
+        ("[8],", "{pi: [8], qf: [8], vf: [8]},", r"net_arch.*not permitted \(vf\)"),
         ("TPMReach-v0:", "- TPMReach-v0:", "valid dictionary"),
         ("lin_0.0003", "lin_0", r"learning_rate.*\^lin_"),
         ("lin_0.0003", "lin_inf", r"learning_rate.*\^lin_"),
@@ -430,3 +437,13 @@ def test_recipe_mistakes_name_file_key_and_choice(before, after, message, tmp_pa
     with pytest.raises(ConfigError, match=message) as caught:
         read_recipe(path, "sac", "TPMReach-v0")
     assert str(caught.value).startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize(("dropped", "quantiles"), [(25, None), (5, 5), (2, 2)])
+def test_a_recipe_of_tqc_that_drops_all_quantiles_is_refused(dropped, quantiles, tmp_path):
+    path = tmp_path / "wrong.yml"
+    given = "" if quantiles is None else f"n_quantiles: {quantiles}, "
+    text = RECIPE.replace("{net_arch", f"{{{given}net_arch")
+    path.write_text(f"{text}  top_quantiles_to_drop_per_net: {dropped}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=f"must be less than n_quantiles, .*not {dropped}"):
+        read_recipe(path, "tqc", "TPMReach-v0")

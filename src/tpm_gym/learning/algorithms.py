@@ -30,7 +30,6 @@ _NUMBER: Final = r"(\d*\.\d*[1-9]\d*|\d*[1-9]\d*\.?\d*)(e-?\d+)?"  # positive, a
 _LAYERS: Final[Any] = Annotated[list[Annotated[int, Field(gt=0, le=4096)]], Field(max_length=20)]
 
 _POLICY_ENTRIES: Final[Mapping[str, Any]] = {
-    "net_arch": _LAYERS | dict[Literal["pi", "qf", "vf"], _LAYERS],
     "log_std_init": float,
     "ortho_init": bool,
     "n_critics": Annotated[int, Field(gt=0, le=100)],
@@ -105,12 +104,16 @@ class Algorithm:
         kind: Any = self.load_class()
         arguments = inspect.signature(kind).parameters
         policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters
+        off_policy = "replay_buffer_class" in arguments
         found = {name: entry for name, entry in _ENTRIES.items() if name in arguments}
         if "ent_coef" in found and isinstance(arguments["ent_coef"].default, str):
             found["ent_coef"] = _LEARNED_ENTROPY
-        shown = _RECORDED if "replay_buffer_class" in arguments else _CLONED
+        shown = _RECORDED if off_policy else _CLONED
         found["demonstrations"] = _keys("Demonstrations", shown, total=False)
         inner = {name: entry for name, entry in _POLICY_ENTRIES.items() if name in policy}
+        networks = {"pi": _LAYERS, "qf" if off_policy else "vf": _LAYERS}
+        # An algorithm with a replay buffer fails if one of its two networks is missing.
+        inner["net_arch"] = _LAYERS | _keys("Networks", networks, total=off_policy)
         found |= {
             "n_timesteps": Required[_COUNT],
             "n_envs": _COUNT,

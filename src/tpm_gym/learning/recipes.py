@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any, Final, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -24,6 +24,8 @@ from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.resources import RECIPES
 from tpm_gym.simulation.engine import require_engine
+
+_QUANTILES: Final = 25  # default of TQC's policy
 
 
 @dataclass(frozen=True)
@@ -199,16 +201,31 @@ def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
     try:
         TypeAdapter(kind, config=strict).validate_python(recipes)
     except ValidationError as error:
-        first = error.errors()[0]
+        first, *_ = found = error.errors()
         # A value of several types has an error for each.
         place = first["loc"][:2]
-        problems = [e["msg"] for e in error.errors() if e["loc"][:2] == place]
+        keyed = "missing", "extra_forbidden"
+        problems = [
+            e["msg"] + (f" ({e['loc'][-1]})" if e["type"] in keyed and e is not first else "")
+            for e in found
+            if e["loc"][:2] == place
+        ]
         problem = " or ".join(dict.fromkeys(problems))
         if first["type"] == "extra_forbidden" and len(first["loc"]) == 2:
             problem = f"unknown key; valid keys: {', '.join(sorted(get_type_hints(entries)))}"
         where = ".".join(map(str, first["loc"]))
         raise ConfigError(f"{source}: {where}: {problem}, not {first['input']!r:.100}") from error
     for name, recipe in recipes.items():
-        if "replay_buffer_kwargs" in recipe and "replay_buffer_class" not in recipe:
-            where = f"{source}: {name}.replay_buffer_kwargs"
-            raise ConfigError(f"{where}: no effect without replay_buffer_class: HerReplayBuffer")
+        policy = recipe.get("policy_kwargs", {})
+        for part, key, kind in (
+            (recipe, "replay_buffer", "HerReplayBuffer"),
+            (policy, "features_extractor", "GoalGapExtractor"),
+        ):
+            if f"{key}_kwargs" in part and f"{key}_class" not in part:
+                where = f"{source}: {name}.{key}_kwargs"
+                raise ConfigError(f"{where}: no effect without {key}_class: {kind}")
+        dropped = ALGORITHMS[algorithm].argument(recipe, "top_quantiles_to_drop_per_net")
+        there = policy.get("n_quantiles", _QUANTILES)
+        if dropped is not None and dropped >= there:
+            where = f"{source}: {name}.top_quantiles_to_drop_per_net"
+            raise ConfigError(f"{where}: must be less than n_quantiles, {there}, not {dropped}")
