@@ -6,6 +6,7 @@ import shlex
 import shutil
 import signal
 import sys
+from typing import Any
 
 import gymnasium as gym
 import pytest
@@ -126,15 +127,24 @@ def test_what_is_no_environment_of_ours_is_refused(env_id, message):
 
 def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered():
     from tpm_gym import TPMEnv
+    from tpm_gym.envs.vector import TPMVectorEnv
 
     class Mine(TPMEnv):
         pass
 
-    gym.register(id="Mine-v0", entry_point=Mine, max_episode_steps=5, kwargs={"task": "reach"})
+    registration: dict[str, Any] = {"entry_point": Mine, "kwargs": {"task": "reach"}}
+    needed: dict[str, Any] = {"vector_entry_point": TPMVectorEnv, "max_episode_steps": 5}
     try:
+        for name in needed:  # without vectors nothing is evaluated, without an end for ever
+            others = {key: value for key, value in needed.items() if key != name}
+            gym.register(id="Mine-v0", **registration, **others)
+            with pytest.raises(ConfigError, match=f"Mine-v0 is registered without .*{name}"):
+                check_env_id("Mine-v0")
+            del gym.registry["Mine-v0"]
+        gym.register(id="Mine-v0", **registration, **needed)
         env = make_env(check_env_id("Mine-v0"), penalty_weight=0.5)
         assert isinstance(env.unwrapped, Mine)
         assert env.unwrapped.task.penalty_weight == 0.5
         env.close()
     finally:
-        del gym.registry["Mine-v0"]
+        gym.registry.pop("Mine-v0", None)

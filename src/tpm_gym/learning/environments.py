@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
 
-from tpm_gym.envs.ids import env_ids
+from tpm_gym.envs.ids import VECTOR_ENTRY_POINT, env_ids
 from tpm_gym.envs.single import TPMEnv
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.errors import ConfigError
@@ -54,13 +54,22 @@ def check_env_id(env_id: str) -> EnvSpec:
             file = getattr(sys.modules[module], "__file__", None) or "a part of Python"
             there = f"the module is {file}; if you mean another file, give it another name"
         raise ConfigError(f"unknown environment {env_id!r}; {there}") from error
-    entry: Any = spec.entry_point
+    if not _derives(spec.entry_point, TPMEnv):
+        raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
+    if not (_derives(spec.vector_entry_point, TPMVectorEnv) and spec.max_episode_steps):
+        raise ConfigError(
+            f"{env_id} is registered without vector_entry_point or max_episode_steps; register it "
+            f"with vector_entry_point={VECTOR_ENTRY_POINT!r} and the steps of an episode"
+        )
+    return spec
+
+
+def _derives(entry: Any, kind: type) -> bool:
+    """Return whether the entry point of a registration is a class derived from ``kind``."""
     if isinstance(entry, str):
         with suppress(ImportError, AttributeError):
             entry = load_env_creator(entry)
-    if not (isinstance(entry, type) and issubclass(entry, TPMEnv)):
-        raise ConfigError(f"{env_id} is no environment of tpm_gym; it makes {spec.entry_point}")
-    return spec
+    return isinstance(entry, type) and issubclass(entry, kind)
 
 
 def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> GoalEnv:
