@@ -263,6 +263,27 @@ def test_play_goes_on_with_the_next_seed_pauses_and_begins_anew(viewer):
     do(viewer, play.discard)
 
 
+def test_a_seed_that_is_chosen_is_the_next_that_is_played(viewer):
+    play = viewer.play
+    choose(viewer, play.env_id, "TPMReach-v0")
+    do(viewer, play.step)
+    choose(viewer, play.seed, 70)
+    do(viewer, play.new)
+    assert (len(play.player.records), play.seed.value) == (0, 70)
+    do(viewer, play.step)
+    do(viewer, play.discard)
+
+
+def test_another_environment_has_its_own_policies_whatever_is_chosen_after_it(viewer):
+    play = viewer.play
+    choose(viewer, play.env_id, "TPMReach-v0")
+    viewer.worker.put("test", lambda: time.sleep(0.2))  # both choices wait for the worker
+    play.env_id.value = "TPMPickAndPlace-v0"
+    choose(viewer, play.engine, "pybullet" if play.engine.value == "analytic" else "analytic")
+    assert play.policy.options == policies_for("TPMPickAndPlace-v0")
+    choose(viewer, play.engine, "analytic")
+
+
 def test_a_page_cannot_choose_what_is_imported(viewer, tmp_path, monkeypatch):
     (tmp_path / "evil_module.py").write_text("raise SystemExit('imported')")
     monkeypatch.syspath_prepend(tmp_path)

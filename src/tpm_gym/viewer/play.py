@@ -71,7 +71,7 @@ class Play:
     def _connect(self) -> None:
         for handle in (self.engine, self.policy, self.file):
             handle.on_update(lambda _: self._worker.ask("player", self.discard))
-        self.env_id.on_update(lambda _: self._worker.ask("player", self._set_env))
+        self.env_id.on_update(lambda _: self._worker.ask("environment", self._set_env))
         self.speed.on_update(lambda _: self._worker.ask("speed", self._set_speed))
         self.seed.on_update(lambda _: self._worker.ask("seed", self.discard_episode))
         jobs = {
@@ -120,8 +120,9 @@ class Play:
 
     def discard_episode(self) -> None:
         """Let the next step begin the episode of the panel's seed."""
+        self._rest = 0
         if self.player is not None:
-            self.player.ended = True
+            self.player.ended, self.player.records = True, []
 
     def _set_env(self) -> None:
         self.discard()
