@@ -20,6 +20,7 @@ from tpm_gym.errors import (
     EpisodeError,
     InputError,
     ResetOptionError,
+    UnreachableError,
 )
 
 PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJointsDense-v0", "TPMReach-v0"
@@ -292,6 +293,16 @@ def test_a_refused_reset_seeds_nothing(wrong):
                 envs.reset(**wrong)
         found.append((envs.step(np.zeros((4, 4)))[0], envs.reset()[0], envs.reset(seed=7)[0]))
     assert_same(*found)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_refused_first_reset_of_some_starts_nothing(threads):
+    envs = make(PICK, 4, num_threads=threads)
+    options = {"reset_mask": np.arange(4) > 1, "goal": [9.0, 9.0, 9.0]}
+    with pytest.raises(UnreachableError):
+        envs.reset(seed=0, options=options)
+    with pytest.raises(EpisodeError, match=r"environment 0; call reset\(\) first"):
+        envs.step(np.zeros((4, 4)))
 
 
 MANY = """

@@ -238,11 +238,11 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """Raise if the environments are closed, or one needs a reset by the user."""
         if self.closed:
             self._require_open()
-        if self.autoreset_mode == AutoresetMode.NEXT_STEP and self._parts[0].core.rngs:
+        begun = all(part.core.rngs for part in self._parts)
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP and begun:
             return
         ended = np.flatnonzero(np.concatenate([part.ended for part in self._parts]))
         if len(ended):
-            begun = bool(self._parts[0].core.rngs)
             way = ', for some with options={"reset_mask": ...}' if begun else " first"
             raise EpisodeError(
                 f"no episode is running in environment {ended[0]}; call reset(){way}"
@@ -388,14 +388,14 @@ class _Part:
         """Start episodes in some environments, with new generators where some are given."""
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
-        infos = {}
-        if not core.rngs and len(rows) < core.count:
+        infos, first = {}, not core.rngs
+        if len(rows):
+            infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
+        if first and len(rows) < core.count:
             # The engine needs all robots at home. The others still wait for their own reset.
             others = np.setdiff1d(np.arange(core.count), rows)
             self._begin(others, [own[k] for k in others.tolist()])
             self.ended[others] = True
-        if len(rows):
-            infos = self._begin(rows, [rngs[k] or own[k] for k in rows.tolist()], options)
         observation, _, info = core.report()
         return observation, {**_masked(info, rows, core.count), **infos}
 
