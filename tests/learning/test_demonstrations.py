@@ -74,6 +74,38 @@ def test_every_second_episode_is_disturbed_and_the_vacuum_never():
     assert set(after[:, 3]) == {-1.0, 1.0}
 
 
+def test_an_episode_that_ends_early_is_followed_by_another_and_all_are_whole():
+    count, drive = 64, {"stiffness": 1500.0, "damping": 10.0}  # too weak for full speed
+    envs = gym.make_vec(
+        "TPMPickAndPlace-v0",
+        num_envs=count,
+        engine="analytic",
+        autoreset_mode="SameStep",
+        drive=drive,
+    )
+    venv, kind = AnalyticVecEnv(envs), PenaltyHerReplayBuffer
+    model = SAC("MultiInputPolicy", venv, seed=1, buffer_size=6400, replay_buffer_class=kind)
+    model._setup_learn(1, callback := Demonstrations(episodes=count, noise=3.0))
+    callback.init_callback(model)
+    callback.on_training_start({}, {})
+    buffer: Any = model.replay_buffer
+    assert buffer.pos == HORIZON
+    ends = np.argwhere(buffer.dones[:HORIZON])
+    assert len(ends) > count  # some ended early
+    assert set(ends[ends[:, 0] == HORIZON - 1][:, 1]) == set(range(count))
+    assert (buffer.ep_length[:HORIZON] > 0).all()  # every step is of an episode with an end
+    assert buffer.timeouts[:HORIZON].sum() == len(ends)
+
+
+def test_episodes_are_as_long_as_those_of_the_training():
+    venv = make_vec_env("TPMReach-v0", n_envs=1, env_kwargs={"max_episode_steps": 20})
+    model = PPO("MultiInputPolicy", venv, n_steps=10, batch_size=10)
+    model._setup_learn(1, callback := Demonstrations(episodes=2, epochs=1))
+    callback.init_callback(model)
+    callback.on_training_start({}, {})
+    assert model.num_timesteps == 2 * 20
+
+
 def test_they_are_not_played_again_when_a_run_goes_on():
     model, callback = filled(episodes=2, noise=0.0)
     model.learn(1, callback=callback, reset_num_timesteps=False)

@@ -97,24 +97,31 @@ class Demonstrations(BaseCallback):
         """Play all episodes: one in each environment at a time."""
         model = self.model
         count, spec = self.training_env.num_envs, self.training_env.get_attr("spec")[0]
-        options = {name: own for name, own in spec.kwargs.items() if name not in _OTHER}
+        options = {"max_episode_steps": spec.max_episode_steps, **spec.kwargs}
+        options = {name: own for name, own in options.items() if name not in _OTHER}
         envs = make_envs(spec.id, count, autoreset_mode=AutoresetMode.DISABLED, **options)
         expert, rng = Expert(envs), np.random.default_rng(model.seed)
         outcomes: list[bool] = []
         for episode in range(0, self.episodes, count):
             noise = self.noise * (np.arange(episode, episode + count) % 2)
             seen, _ = envs.reset(seed=rng.integers(1_000_000, size=count).tolist())
-            ended = np.zeros(count, dtype=np.bool_)
-            while not ended.all():
+            left = np.ones(count, dtype=np.bool_)
+            while left.any():
                 wanted = expert.act(seen)
                 actions = wanted.copy()
                 actions[:, :3] += noise[:, None] * rng.normal(size=(count, 3))
                 actions = np.clip(actions, -1, 1).astype(np.float32)
                 after, rewards, _, ended, told = envs.step(actions)
+                left &= ~ended
+                # Past a singularity an episode ends early. Another takes its place, since a buffer
+                # records all environments at once; it ends with the last of the others.
+                ended |= not left.any()
                 yield _Step(seen, wanted, actions, after, rewards, ended, told)
                 model.num_timesteps += count
+                outcomes += [bool(success) for success in told["is_success"][ended]]
                 seen = after
-            outcomes += [bool(success) for success in told["is_success"]]
+                if ended.any() and left.any():
+                    seen, _ = envs.reset(options={"reset_mask": ended})
         envs.close()
         self.successes = float(np.mean(outcomes))
 
@@ -129,9 +136,9 @@ def _returns(steps: Sequence[_Step], gamma: float) -> list[NDArray[Any]]:
     Without discount, that sum would be infinite, and the last reward counts once.
     """
     found: list[NDArray[Any]] = []
-    total = np.zeros(0)
+    total: Any = 0.0
     for step in reversed(steps):
         last = step.rewards / (1 - gamma if gamma < 1 else 1)
-        total = last if step.ended.all() else step.rewards + gamma * total
+        total = np.where(step.ended, last, step.rewards + gamma * total)
         found.append(total)
     return found[::-1]
