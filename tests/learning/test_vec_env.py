@@ -1,11 +1,12 @@
 """Environments of the analytic engine behind Stable-Baselines3, and policies evaluated in them."""
 
+from contextlib import closing
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import tpm_gym
 from tpm_gym.learning import AnalyticVecEnv
@@ -51,3 +52,10 @@ def test_another_autoreset_is_refused():
     one = gym.make(PICK, engine="analytic")
     with pytest.raises(tpm_gym.errors.ConfigurationError, match=r"gym\.make_vec"):
         AnalyticVecEnv(one)
+
+
+def test_an_exported_policy_is_compared_with_it():
+    with closing(VecMonitor(vec_env())) as envs:
+        tpm_gym.load_policy(PICK).check(envs)
+        with pytest.raises(tpm_gym.errors.PolicyMismatchError, match="control joints"):
+            tpm_gym.load_policy("TPMPickAndPlaceJoints-v0").check(envs)

@@ -184,10 +184,9 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
 
 def _control(env: Any) -> str | None:
     """Return the name of an environment's control; None if it is not of tpm_gym."""
+    if hasattr(env, "has_attr") and env.has_attr("control"):  # of Stable-Baselines3
+        return getattr(env.get_attr("control")[0], "name", None)
     own = getattr(env, "unwrapped", env)
     # Gymnasium's SyncVectorEnv has a list of environments, and no method that is safe to call here.
     first = next(iter(getattr(own, "envs", [])), own)
-    control = getattr(getattr(first, "unwrapped", first), "control", None)
-    if hasattr(env, "has_attr") and env.has_attr("control"):
-        control = env.get_attr("control")[0]
-    return getattr(control, "name", None)
+    return getattr(getattr(getattr(first, "unwrapped", first), "control", None), "name", None)
