@@ -6,6 +6,7 @@ import pickle
 import re
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -405,3 +406,20 @@ def test_command_keeps_no_folder_outside(monkeypatch, tmp_path):
     words = ["train/train.py", "--run", str(inside), f"--json={outside}", "--seed", "3"]
     expected = "python train/train.py --run 'runs/a b' --json=x.json --seed 3"
     assert provenance.command_line(words) == expected
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_the_commit_of_a_checkout_that_only_surrounds_the_package_is_not_recorded(
+    tmp_path, monkeypatch
+):
+    installed = tmp_path / ".venv" / "provenance.py"
+    installed.parent.mkdir()
+    installed.touch()
+    (tmp_path / "theirs").touch()
+    who = ["-c", "user.name=me", "-c", "user.email=me@example.com"]
+    for words in (["init", "-q"], ["add", "theirs"], [*who, "commit", "-qm", "theirs"]):
+        subprocess.run(["git", "-C", str(tmp_path), *words], check=True)
+    monkeypatch.setattr(provenance, "__file__", str(installed))
+    assert provenance.git_commit() is None
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "theirs"))
+    assert len(provenance.git_commit() or "") == 40

@@ -52,12 +52,17 @@ def git_commit() -> str | None:
 
     ``+modified`` is appended if tracked files differ from the commit.
     """
-    words = ["git", "-C", str(Path(__file__).parent), "describe"]
-    words += ["--always", "--abbrev=40", "--match=", "--dirty=+modified"]
+    here = Path(__file__)
+    git = ["git", "-C", str(here.parent)]
+    words = ["describe", "--always", "--abbrev=40", "--match=", "--dirty=+modified"]
     try:
-        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+        # An installed package may lie in a checkout of the user's, which does not track its files.
+        tracked = [*git, "ls-files", "--error-unmatch", here.name]
+        subprocess.run(tracked, capture_output=True, check=True)
+        found = subprocess.run([*git, *words], capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return None
+    return found.stdout.strip()
 
 
 def machine() -> dict[str, Any]:
