@@ -46,6 +46,20 @@ def test_it_is_sb3s_own_vector_of_single_environments():
             assert info["episode"]["l"] == 6
 
 
+def test_options_are_of_their_environments_and_of_the_next_reset_only():
+    theirs = DummyVecEnv([lambda: gym.make(PICK, engine="analytic")] * 3)
+    ours, goal = vec_env(), [0.02, -0.03, 0.05]
+    for options in ({"goal": goal}, [{}, {"goal": goal}, {}], {}):
+        found = []
+        for envs in (ours, theirs):
+            envs.seed(4)
+            envs.set_options(options)
+            found.append((envs.reset(), envs.reset()))
+        for one, other in zip(*found, strict=True):
+            for name in one:
+                np.testing.assert_array_equal(one[name], other[name])
+
+
 def test_another_autoreset_is_refused():
     with pytest.raises(tpm_gym.errors.ConfigurationError, match=r"autoreset_mode='SameStep'"):
         vec_env(autoreset_mode="NextStep")

@@ -49,10 +49,18 @@ class AnalyticVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Observation:
-        """Start an episode in all environments, with the seeds of :meth:`seed`."""
+        """Start an episode in all environments, with the seeds and options that are set."""
         seeds = None if self._seeds[0] is None else self._seeds
-        observation, _ = self.envs.reset(seed=seeds)
+        observation: Observation = {}
+        own = np.array([bool(options) for options in self._options])
+        for row in np.flatnonzero(own).tolist():
+            options = {**self._options[row], "reset_mask": np.arange(self.num_envs) == row}
+            observation, _ = self.envs.reset(seed=seeds, options=options)
+        if not own.all():
+            others = {"reset_mask": ~own} if own.any() else None
+            observation, _ = self.envs.reset(seed=seeds, options=others)
         self._reset_seeds()
+        self._reset_options()
         self._returns[:], self._lengths[:] = 0.0, 0
         return observation
 
