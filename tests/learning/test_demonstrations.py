@@ -4,8 +4,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 from tpm_gym.learning import (
     AnalyticVecEnv,
@@ -15,6 +17,7 @@ from tpm_gym.learning import (
 )
 from tpm_gym.learning.demonstrations import _returns, _Step
 from tpm_gym.learning.environments import make_envs
+from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.policies import TrainedPolicy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes, summarise
 
@@ -126,6 +129,14 @@ def test_without_a_replay_buffer_the_networks_imitate_them():
     episodes = run_episodes(test, TrainedPolicy(model), 64, TEST_SEED)
     assert summarise(episodes)["success_at_end"].mean > 0.9
     test.close()
+    venv.close()
+
+
+def test_networks_that_see_normalised_observations_are_refused():
+    venv = VecNormalize(make_vec_env("TPMReach-v0"))
+    model = PPO("MultiInputPolicy", venv, n_steps=10, batch_size=10)
+    with pytest.raises(ConfigError, match="norm_obs=False"):
+        model.learn(10, callback=Demonstrations(episodes=1))
     venv.close()
 
 

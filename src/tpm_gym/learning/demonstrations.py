@@ -20,6 +20,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from tpm_gym.learning.cloning import clone
 from tpm_gym.learning.environments import make_envs
+from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import Action, Observation
 from tpm_gym.tasks.expert import Expert
 
@@ -87,6 +88,11 @@ class Demonstrations(BaseCallback):
 
     def _clone(self, model: OnPolicyAlgorithm) -> None:
         """Fit the networks to the steps."""
+        normalised = model.get_vec_normalize_env()
+        if normalised is not None and normalised.norm_obs:
+            # Its statistics change while the policy acts, and the fit would no longer hold.
+            problem = "networks cannot be fitted to observations that are not yet normalised"
+            raise ConfigError(f"VecNormalize: {problem}; give it norm_obs=False")
         steps = list(self._play())
         seen = {k: np.concatenate([step.seen[k] for step in steps]) for k in steps[0].seen}
         wanted = np.concatenate([step.wanted for step in steps])
