@@ -83,7 +83,8 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
     """Return the shipped recipe of an environment as keyword arguments for Stable-Baselines3.
 
     For example ``SAC(env=env, **recipe("TPMReach-v0"))``. The numbers of steps and environments and
-    the demonstrations are left out: they are no arguments of the constructor.
+    the demonstrations are left out: they are no arguments of the constructor. An id without a
+    recipe gets the recipe of pick-and-place.
 
     Args:
         engine: Engine to train in; ``"analytic"`` has recipes of its own.
