@@ -275,6 +275,7 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env):
     others: list[dict[str, Any]] = [
         {"task": "reach"},
         {"machine": "wide"},
+        {"control": "joints"},
         {"randomisation": {"latency": 1}},
         {"physics": PHYSICS},
     ]

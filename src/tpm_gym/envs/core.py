@@ -138,6 +138,7 @@ class Core:
         self._engine = {"engine": engine, "physics": physics, "gui": gui, "renderer": renderer}
         self.kind = {
             "task": type(self.task),
+            "control": control,  # of the delayed actions
             "machine": self.machine,
             "engine": engine,
             "drive": self.drive,
