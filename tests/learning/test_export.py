@@ -311,6 +311,15 @@ def test_mistakes_on_the_command_line_are_one_line(run, words, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("entry", "value"), [("env_options", "wide"), ("algo", ["sac"])])
+def test_a_damaged_configuration_beside_an_archive_is_named(run, entry, value):
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps({**config, entry: value}))
+    with pytest.raises(SystemExit, match=f"config.json of its run is damaged: {entry}: "):
+        main(["export", str(run / "best.zip"), str(run / "out"), "--trust-pickle"])
+    assert not (run / "out.json").exists()
+
+
 def test_files_that_are_no_policy_are_neither_replaced_nor_removed(run):
     (run / "weights.safetensors").write_bytes(b"of another program")
     (run / "list.json").write_text("[]")

@@ -13,10 +13,12 @@ from typing import Any, Final
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from pydantic import TypeAdapter, ValidationError
 from safetensors.numpy import save as safetensors_bytes
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import nn
+from typing_extensions import TypedDict
 
 from tpm_gym import TPMError, load_policy
 from tpm_gym.learning import model_card, provenance
@@ -35,6 +37,17 @@ activation cause far larger errors.
 """
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
+
+
+class _Origin(TypedDict):
+    """Entries of a run's configuration that are part of an exported policy."""
+
+    env: str
+    algo: str
+    seed: int
+    recipe: dict[str, Any]
+    env_options: dict[str, Any]
+    versions: dict[str, Any]
 
 
 def save(
@@ -161,10 +174,17 @@ def convert(
     if (config := next(filter(None, found), None)) is None:
         where = f"no {CONFIG_FILE} of a training beside it or above it"
         raise refused(name, f"{where}; keep the file in its run folder")
+    try:
+        TypeAdapter(_Origin).validate_python(config, strict=True)
+    except ValidationError as error:
+        first = error.errors()[0]
+        problem = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        way = "keep the file in an intact run folder"
+        raise refused(name, f"{CONFIG_FILE} of its run is damaged: {problem}; {way}") from error
     _check_card(path, config["env"], evaluation)
     about = {key: config[key] for key in ("seed", "recipe", "env_options")}
     model = load_model(archive, config["algo"])
-    return save(model, path, env_id=config["env"], versions=config.get("versions"), **about)
+    return save(model, path, env_id=config["env"], versions=config["versions"], **about)
 
 
 def _check_card(path: Path, env_id: str, evaluation: Path | None) -> None:
