@@ -7,12 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import h5py
 import minari
 import numpy as np
 import pytest
 from datasets_on_record import COUNTS, records
 from paths import ROOT
+from registries import registries_put_back
 from trainings import quiet
 
 from tpm_gym.learning.configuration import EnvOptions
@@ -203,3 +205,16 @@ def test_datasets_are_those_on_record(env_id):
         recorded = RECORDED[env_id][kind][first]
         if found[first]["sha256"] != recorded["sha256"]:
             assert found[first]["return"] == pytest.approx(recorded["return"], abs=1e-4)
+
+
+def test_an_id_that_names_no_task_is_collected_with_the_default_one(tmp_path):
+    spec = gym.spec(REACH)
+    with registries_put_back():
+        gym.register(
+            "Plain-v0",
+            entry_point=spec.entry_point,
+            vector_entry_point=spec.vector_entry_point,
+            max_episode_steps=5,
+        )
+        (folder,) = collect(config(tmp_path, "expert", env="Plain-v0", episodes=2), quiet())
+    assert minari.MinariDataset(folder / "data").total_steps == 10

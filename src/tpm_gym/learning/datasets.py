@@ -48,7 +48,7 @@ from tpm_gym.learning.rollout import (
     run_episodes,
     summarise,
 )
-from tpm_gym.tasks.registry import TASKS
+from tpm_gym.tasks.registry import make_task
 from tpm_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -193,8 +193,9 @@ def _complete(config: CollectConfig) -> list[str]:
 
 
 def _has_expert(env: str) -> bool:
-    task = TASKS[check_env_id(env).kwargs["task"]]
-    return task.plan is not Task.plan
+    kwargs = check_env_id(env).kwargs
+    task = make_task(kwargs.get("task", "reach"), kwargs.get("machine"))
+    return type(task).plan is not Task.plan
 
 
 def _reference_scores(env: str, options: EnvOptions) -> tuple[float, float]:
