@@ -4,11 +4,13 @@ import json
 import re
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 from huggingface_hub import ModelCard
 from paths import ROOT
 
 from tpm_gym.learning.command_line import main
+from tpm_gym.policy.files import digest
 
 POLICIES = ROOT / "train" / "policies"
 NAME = "TPMReach-v0"
@@ -34,6 +36,19 @@ def test_a_published_policy_gets_a_card_whose_lines_run(tmp_path, monkeypatch):
     exec(script, {})
 
 
+def test_the_lines_of_a_card_make_the_environment_of_the_training(tmp_path):
+    content = json.loads((POLICIES / f"{NAME}.json").read_text())
+    content["env_options"] = {"machine": "wide", "engine": "analytic", "shield": True}
+    (tmp_path / "own.json").write_text(json.dumps({**content, "sha256": digest(content)}))
+    weights = (POLICIES / f"{NAME}.safetensors").read_bytes()
+    (tmp_path / "own.safetensors").write_bytes(weights)
+    words = [str(tmp_path / "own.json"), str(tmp_path / "reach"), "--evaluation", str(RESULTS)]
+    main(["export", *words])
+    (made,) = re.findall(r"gym\.make\(.*\)", (tmp_path / "reach.md").read_text())
+    spec = eval(made, {"gym": gym}).spec
+    assert spec.kwargs.items() >= content["env_options"].items()
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -41,8 +56,9 @@ def test_a_published_policy_gets_a_card_whose_lines_run(tmp_path, monkeypatch):
         ("{}", "is no result of"),
         (json.dumps(json.loads(RESULTS.read_text()) | {"return": "good"}), "is no result of"),
         (OTHER.read_text(), "the policy is of TPMReach-v0"),
+        (json.dumps(json.loads(RESULTS.read_text()) | {"policy": "expert"}), "is of the expert"),
     ],
-    ids=["damaged", "empty", "text", "another"],
+    ids=["damaged", "empty", "text", "another", "expert"],
 )
 def test_results_of_something_else_are_rejected(content, message, tmp_path):
     evaluation = tmp_path / "evaluation.json"

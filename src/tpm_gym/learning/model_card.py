@@ -9,6 +9,7 @@ import yaml
 
 from tpm_gym.learning import provenance
 from tpm_gym.learning.errors import ConfigError
+from tpm_gym.learning.policies import SCRIPTED
 
 _OURS = "library_name: tpm_gym"
 _WAY = "`tpm-gym evaluate --policy POLICY --json FILE`, with one policy"
@@ -68,6 +69,8 @@ def check(card: Path, env_id: str, evaluation: Path) -> dict[str, Any]:
         }
     except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise ConfigError(f"--evaluation {evaluation}: is no result of {_WAY}") from error
+    if (policy := tested.get("policy")) in SCRIPTED:
+        raise ConfigError(f"--evaluation {evaluation}: is of the {policy} policy; give {_WAY}")
     if env != env_id:
         raise ConfigError(f"--evaluation {evaluation}: is of {env}, the policy is of {env_id}")
     return found
@@ -95,7 +98,10 @@ def _text(name: str, content: Mapping[str, Any], tested: Mapping[str, Any]) -> s
         steps=content["steps"],
         seed=content["seed"],
         hidden=" and ".join(str(width) for width in content["network"]["hidden"]),
-        options="".join(f", {key}={json.dumps(value)}" for key, value in options.items()),
+        options="".join(
+            f", {key}={json.dumps(value) if isinstance(value, str) else value}"
+            for key, value in options.items()
+        ),
         name=name,
         **tested,
     )
