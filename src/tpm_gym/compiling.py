@@ -152,7 +152,7 @@ class _Cache:
 
 _CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
 _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
-"""Packages whose functions enter a stamp by name only; their sources are not read."""
+"""Packages whose functions :func:`stamp` includes by name only; it does not read their sources."""
 
 
 def stamp(function: Callable[..., Any]) -> str:

@@ -59,7 +59,7 @@ def shifted(
 def bounded(
     observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
-    """Clip observations and achieved goals to +-bounds, and convert them and goals to float32.
+    """Clip observations and achieved goals to +-bounds; convert both and the goals to float32.
 
     Returns:
         The three arrays in float32, and whether observations and achieved goals have no NaN.

@@ -205,7 +205,7 @@ class Path:
 
 @cache
 def loops() -> ModuleType:
-    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, and with them Numba."""
+    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, which import Numba."""
     from tpm_gym.simulation import compiled
 
     return compiled

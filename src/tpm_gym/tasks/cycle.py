@@ -46,7 +46,7 @@ motors must be able to brake along x and z at the same time.
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth of P below the gate at which the reward term is -1 in each step, m."""
+"""Depth of P, beyond the tolerance below the gate, at which the reward term is -1, m."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""

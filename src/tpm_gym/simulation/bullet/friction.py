@@ -1,15 +1,16 @@
 """Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
-**Level faces.** The solver limits the friction force of a contact to mu N along each of two
-directions. At 45 degrees to these directions, friction is sqrt(2) times too strong, and it does not
-oppose the slip. On a level face the directions are the world's x and y, and Bullet can scale both
-limits for each body. For a slipping contact, this module scales them so that a corner of the box
-lies on the cone, opposite to the slip. For a sticking contact, the limit along x follows from the
-cone and the last force along y, and vice versa. Without a last force, the box lies inside the cone.
+**Level faces.** The solver limits the friction force of a contact to mu N (coefficient times normal
+force) along each of two directions. At 45 degrees to these directions, friction is sqrt(2) times
+too strong, and it does not oppose the slip. On a level face the directions are the world's x and
+y, and Bullet can scale both limits for each body. For a slipping contact, this module scales both
+limits so that a corner of the box lies on the cone, opposite to the slip. For a sticking contact,
+the limit along x follows from the cone and the last force along y, and vice versa. Without a last
+force, the box lies inside the cone.
 
-**Slides.** All points of a contact share these scales, and contacts between objects have none. So
-this module adds the friction that was missing in the last time step, as a force and a torque. This
-is mu N against the slip of each point, minus the solver's friction.
+**Slides.** All points of a contact share these scales, and contacts between objects have no scales.
+So this module adds the friction that was missing in the last time step, as a force and a torque.
+The missing friction is mu N against the slip of each point, minus the solver's friction.
 
 **Upright faces.** The solver takes N from a solution without friction. But a block that the lip
 pushes leans on the lip only because the table brakes it. In a solution without friction N is 0, so
@@ -50,8 +51,8 @@ _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the
 _Push = tuple[Vector, float]
 """Friction that was added to a contact in a time step, N.
 
-It is given as the second part of the force (see ``compiled.friction_force``), and the largest force
-that could be added.
+The two values are the second part of the force (see ``compiled.friction_force``), and the largest
+force that could be added.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
@@ -66,7 +67,7 @@ _Lacks = dict[tuple[int, int], _Wrench]
 class _Face:
     """Level face on which objects slide, and the scales of its friction along x and y.
 
-    Its surface moves along x at ``speed``, m/s.
+    The face moves along x at ``speed``, m/s.
     """
 
     def __init__(self, body: int, link: int) -> None:
@@ -244,7 +245,7 @@ class Friction:
 
         Args:
             motion: Motion of the object.
-            other: Motion of what it touches.
+            other: Motion of the body that the object touches.
             points: PyBullet's contact points.
             coefficient: Coulomb's coefficient.
             face: Face of the other body; None for an object.

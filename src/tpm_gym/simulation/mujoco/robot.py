@@ -4,7 +4,7 @@ Ideal motors reach their references exactly, as far as their largest torque allo
 motor is a constraint on the velocity at the end of the time step, with a limited force. Dry
 friction in MuJoCo is such a constraint, with velocity zero. The first half of a time step
 (``mj_step1``) creates the rows of the friction constraints, and the second half (``mj_step2``)
-solves them. Between both, this module sets the velocity of these rows.
+solves them. Between the two halves, this module sets the velocity of these rows.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class Robot:
         self._set_targets((0.0,))
 
     def _set_targets(self, targets: Sequence[float]) -> None:
-        """Set the targets of the ideal motors (rad), if any; the last is the cup's slide's (m)."""
+        """Set the targets of the ideal motors (rad), if any, then of the cup's slide (m)."""
         data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
         for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):
