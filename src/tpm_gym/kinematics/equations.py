@@ -120,10 +120,15 @@ def assembly_at(
     second centre has a positive planar factor, the other intersection a negative one.
 
     Returns:
-        The assembly; whether it is real; and five values that explain why it is not: whether xC and
-        zC are real and rod 11 fits; y1, m; the squared distance of the circles' centres, m^2; and
-        the level and the vertical distance from B3 to C3 for a link 7 of length 0, m. If rod 11
-        fits although the assembly is not real, then a2 = b2 = 0, and rod 11 fits for every beta.
+        The assembly, whether it is real, and five values that explain why it is not. In this order,
+        the values are:
+
+        * whether the circles meet and rod 11 fits. If this is true although the assembly is not
+          real, then a2 = b2 = 0 in Eq. (10), and rod 11 fits for every beta;
+        * y1, m;
+        * the squared distance of the circles' centres, m^2;
+        * for a link 7 of length 0, the horizontal distance from B3 to C3, m;
+        * for a link 7 of length 0, the vertical distance from B3 to C3, m.
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]
@@ -158,10 +163,14 @@ def posture_at(
     """Solve inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
 
     Returns:
-        theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
-        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For :func:`leg_margin`,
-        distances of C_i from A_i in the arm's plane, m: the level distances of legs 1, 2 and 3, and
-        the vertical distance of leg 3.
+        Four results, in this order.
+
+        * the angles: theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi). Arms 1 and 3 point
+          inwards at pi, arm 2 at 0;
+        * whether the angles are real;
+        * xC, zC, cos(beta) and sin(beta);
+        * for :func:`leg_margin`, distances of C_i from A_i in the arm's plane, m: the horizontal
+          distances of legs 1, 2 and 3, and the vertical distance of leg 3.
     """
     x, y, z = point
     side, bend1, bend2, bend3 = signs
@@ -182,13 +191,16 @@ def posture_at(
 def arm(
     a: Numbers, b: Numbers, out: Numbers, bend: Numbers, g: LegLengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
-    """Compute the arm's angle in (-pi, pi] from |C - A - l3 e(theta)| = l4.
+    """Compute the arm's angle theta in (-pi, pi] from |C - A - l3 e(theta)| = l4.
+
+    Here e(theta) is the unit vector along the arm.
 
     Args:
-        a: Distance of C from A, level in the arm's plane, m.
-        b: Vertical distance, m.
-        out: Distance out of the arm's plane, m.
-        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); names one of two solutions.
+        a: Horizontal distance of C from A in the arm's plane, m.
+        b: Vertical distance of C from A, m.
+        out: Distance of C from the arm's plane, m.
+        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); it selects one of the two
+            solutions.
         g: Lengths.
         ns: Namespace.
 
@@ -249,8 +261,8 @@ def link_velocity(
 ) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers], Triple]:
     """Compute the rates of xC, zC and l7 beta for unit rates of the motors, m/rad.
 
-    The rates solve the derivatives of the closures, with determinant l7 sin(beta) level3 planar.
-    Motor 3 does not move link 3'.
+    The rates solve a linear system, the derivatives of the closures by time. The determinant of
+    this system is sin(beta) * level3 * planar. Motor 3 does not move link 3'.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
     # Divisions take longer than all else, so each divisor is inverted once.
@@ -262,7 +274,7 @@ def link_velocity(
 
 
 def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
-    """Compute the rows of J, v = J theta_dot, m/rad; it exists at serial singularities too."""
+    """Compute the rows of J, v = J theta_dot, m/rad; J exists at serial singularities too."""
     sin_beta, cos_beta = values.sin_beta, values.cos_beta
     (x1, x2), (z1, z2), (turn1, turn2, turn3) = link_velocity(bars, values)
     return (
@@ -273,12 +285,12 @@ def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Trip
 
 
 def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
-    """Compute smallest over largest singular value, s3 / s1, of a matrix (3, 3).
+    """Compute smallest over largest singular value, s3 / s1, of a matrix M (3, 3).
 
-    |det| = s1 s2 s3, and the matrix of cofactors has the largest singular value s1 s2. So this is
-    |det| divided by s1 and by s1 s2. If s3 were computed as the root of the smallest eigenvalue of
-    J J^T, half of its digits would be lost. Where s1 and s2 nearly coincide, the result is accurate
-    to 1e-9 only.
+    |det M| = s1 s2 s3, and the matrix of cofactors has the largest singular value s1 s2. So s3 / s1
+    is |det M| divided by s1 and by s1 s2. If s3 were computed as the root of the smallest
+    eigenvalue of M M^T, half of its digits would be lost. Where s1 and s2 nearly coincide, the
+    result is accurate to 1e-9 only.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)
@@ -310,7 +322,7 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
 
 
 def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> UnreachableError:
-    """Explain which loop does not close on a branch at theta (3) rad, and by how much."""
+    """Explain which loop does not close in an assembly mode at theta (3,) rad, and by how much."""
     with np.errstate(all="ignore"):
         cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
         _, _, found = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
@@ -330,7 +342,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
 
 
 def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableError:
-    """Explain which leg does not reach a point (3) m on a branch, and by how much."""
+    """Explain which leg does not reach a point (3,) m in a working mode, and by how much."""
     hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
     beyond = g.l7 - abs(point[1])
     if beyond < 0:
@@ -347,7 +359,11 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
     """Return the margin by which a leg reaches, m; negative if it does not.
 
-    Distances of C from A in m: level and vertical in the arm's plane, and out of it.
+    Args:
+        level: Horizontal distance of C from A in the arm's plane, m.
+        vertical: Vertical distance of C from A, m.
+        out: Distance of C from the arm's plane, m.
+        g: Lengths.
     """
     if abs(out) >= g.l4:
         return g.l4 - abs(out)

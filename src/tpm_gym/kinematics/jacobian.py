@@ -6,7 +6,8 @@ A v = B theta_dot (section "Singularity analysis"). Configurations are given by 
 working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
 
 All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions of angles
-raise it also if theta is not finite, and UnreachableError if the branch does not exist somewhere.
+also raise InputError if theta is not finite, and UnreachableError if the assembly mode does not
+exist at some theta.
 """
 
 import math
@@ -136,8 +137,8 @@ def conditioning_at(
 ) -> FloatArray:
     """Compute 1/cond(J) at points, (...,).
 
-    It is 0 unless a point is reachable in the working mode ``branch`` and in the assembly mode
-    ``assembly``.
+    The result is 0 unless a point is reachable in the working mode ``branch`` and in the assembly
+    mode ``assembly``.
 
     To differentiate by the lengths, pass points as a tensor and the lengths as tensors in a
     :class:`tpm_gym.kinematics.geometry.Lengths`.
@@ -184,7 +185,12 @@ def factors_at(
 def _regular(
     results: _Results, theta: ArrayLike, branch: AssemblyMode, g: Geometry
 ) -> list[FloatArray]:
-    """Compute results; raise SingularityError for the smallest factor if J does not exist."""
+    """Compute results for configurations in which J exists.
+
+    Raises:
+        SingularityError: If J does not exist in a configuration; the error names the smallest
+            factor of det A.
+    """
     singular, *found = _from_angles(lambda c: [c.factors[:3], *results(c)], theta, branch, g)
     names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
     scaled = [singular[..., i].reshape(-1) / (1.0, g.l4, g.l4**2)[i] for i in range(3)]
@@ -217,7 +223,7 @@ def _from_angles(
 def _from_points(
     results: _Results, position: ArrayLike, branch: WorkingMode, g: AnyLengths, missing: float
 ) -> list[FloatArray]:
-    """Compute results for configurations at points; ``missing`` where there is none."""
+    """Compute results for configurations at points; ``missing`` where a point is out of reach."""
 
     def text(point: equations.Triple, ns: Namespace) -> list[Numbers]:
         theta, real, link7, _ = equations.posture_at(point, branch.signs, g, ns)

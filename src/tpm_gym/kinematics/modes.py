@@ -44,8 +44,9 @@ class AssemblyMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16).
-            It is the side of the line through the two circle centres on which link 3' is.
-        sin_beta: Sign of sin(beta), and so of y: the half in which the platform is assembled.
+            It tells on which side of a line link 3' is: the line through the centres of the two
+            circles of Eq. (6).
+        sin_beta: Sign of sin(beta), and so of y: the side of y = 0 on which the platform is.
     """
 
     planar: int
@@ -75,9 +76,9 @@ class RotatedMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: the side on
-            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. Where rods 4a
-            and 4b, seen along y, are shorter than links 3 and 3', -1 names the two assemblies of
-            link 3' with the smaller planar factors.
+            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. If rods 4a
+            and 4b, seen along y, are shorter than links 3 and 3', the value -1 means the two
+            assemblies of link 3' with the smaller planar factors.
         further: Names one of the two assemblies of link 3' with the same ``planar``: -1 has the
             smaller tilt phi in [0, 2 pi), 1 the larger one.
         sin_beta: Sign of sin(beta), and so of y.
@@ -116,8 +117,8 @@ class ForwardSolutions:
     """All solutions of the forward kinematics, one slot per :data:`ASSEMBLY_MODES` entry.
 
     Attributes:
-        position: (..., 4, 3) m, point P in the paper frame; NaN where not real. Where beta is
-            free, z alone is a number.
+        position: (..., 4, 3) m, point P in the paper frame; NaN where not real. Where the
+            mechanism closes for every beta (see ``free``), x and y are NaN, but z is not.
         beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where not real.
         valid: (..., 4) bool, whether the branch is real.
         geometry: Lengths of the mechanism.

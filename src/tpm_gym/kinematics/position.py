@@ -34,8 +34,9 @@ from tpm_gym.kinematics.namespaces import Namespace, by_rows
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
     """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
-    A branch keeps its slot as theta moves. It is NaN where it is not real; only z is a number
-    where beta is free. For assemblies with link 3' turned, see :func:`.rotated.forward_rotated`.
+    A branch keeps its slot as theta moves. Its results are NaN where it is not real; but where the
+    mechanism closes for every beta, z is not NaN. For assemblies with link 3' turned, see
+    :func:`.rotated.forward_rotated`.
     """
     require_geometry(geometry)
     angles = points("theta", theta)

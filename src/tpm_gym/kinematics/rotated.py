@@ -131,9 +131,9 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Compute the postures (..., 48) with link 3' turned and P at position (..., 3) m.
 
-    Slots are ordered by the sign of cos(beta), then by the tilt (6, ascending), then by the sign of
-    B_iC_i . dB_i/dtheta_i of leg 2, then of leg 3; -1 comes before 1. Positions that are not finite
-    have no posture.
+    Slots are ordered by the sign of cos(beta), then by the tilt (6 values, ascending), then by the
+    sign of B_2C_2 . dB_2/dtheta_2, then by the sign of B_3C_3 . dB_3/dtheta_3; -1 comes before 1.
+    Positions that are not finite have no posture.
 
     Raises:
         InputError: If position is no array (..., 3) of numbers.
@@ -209,8 +209,9 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 
     Seen along y, the vector from B1 to C1 is rho n with n = exp(-i phi / 2), since it halves the
     angle between links 3 and 3'. Then rods 4a and 4b have the same closure, which gives rho^2. With
-    this rho^2, the closure of rod 6 is 2 rho p = q. Its square, 4 rho^2 p^2 = q^2, is a
-    trigonometric polynomial of degree 2 in phi, a quartic in tan(phi / 2).
+    this rho^2, the closure of rod 6 has the form 2 rho p = q, where p and q depend on phi only. The
+    squared equation, 4 rho^2 p^2 = q^2, is a trigonometric polynomial of degree 2 in phi, a quartic
+    in tan(phi / 2).
     """
     g = geometry
     b1, b2, _ = np.moveaxis(_elbows(theta, g), -2, 0)
@@ -250,10 +251,11 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
     """Solve for theta_1 and tilt, (..., 6), given P, and P - C1 in the frame of link 3'.
 
-    Both vectors, ``p`` and ``link7``, are seen along y. For a tilt phi, ``terms`` returns the value
-    ``up`` of l3 sin(theta_1) for which B1C1 halves the angle between links 3 and 3', and the value
-    ``out`` of l3 cos(theta_1) for which rods 4 have their length. So up^2 + out^2 = l3^2 gives phi.
-    Multiplied by cos^2(phi / 2), this equation is a trigonometric polynomial of degree 3.
+    Both vectors, ``p`` and ``link7``, are seen along y. The inner function ``terms`` returns two
+    values for a tilt phi: ``up`` is the l3 sin(theta_1) for which B1C1 halves the angle between
+    links 3 and 3', and ``out`` is the l3 cos(theta_1) for which rods 4 have their length. So the
+    equation up^2 + out^2 = l3^2 gives phi. Multiplied by cos^2(phi / 2), this equation is a
+    trigonometric polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 
@@ -293,7 +295,7 @@ def _refined(
     one: FloatArray,
     two: FloatArray,
 ) -> tuple[_Pair, _Pair, _Four]:
-    """Refine two unknowns by Newton's method; return them, the closures and their derivatives."""
+    """Refine two unknowns by Newton's method; return unknowns, closures, closures' derivatives."""
     for _ in range(_STEPS):
         (e, f), (a, b, c, d) = closures(one, two)
         determinant = a * d - b * c

@@ -47,16 +47,18 @@ def save(
     env_options: Mapping[str, Any] | None = None,
     versions: Mapping[str, str | None] | None = None,
 ) -> Path:
-    """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
+    """Write the policy of a model; return the path of the JSON file.
 
-    The files get their final names only after a check that the written policy acts like the model.
+    The files are ``path``.safetensors and ``path``.json.
+
+    They get their final names only after a check that the written policy acts like the model.
     A policy that the files cannot express is therefore refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Common name of the files. An earlier policy is replaced.
-        env_options: Machine, engine, drive and shield of the training. Those left out are the
-            defaults of ``env_id``.
+        env_options: Machine, engine, drive and shield of the training. Options that are left out
+            have the defaults of ``env_id``.
         versions: Versions at training; by default the installed ones.
 
     Raises:

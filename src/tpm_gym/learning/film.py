@@ -62,7 +62,10 @@ def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
 
 
 def _moments(frames: list[Frame]) -> list[int]:
-    """Choose the first frame, the last, and repeatedly the one least like all chosen frames."""
+    """Return the indices of six frames that differ most.
+
+    Choose the first and the last frame, then repeatedly the frame least like all chosen frames.
+    """
     pictures = np.stack(frames)[:, ::2, ::2].astype(np.int16)
 
     def differences(index: int) -> NDArray[Any]:

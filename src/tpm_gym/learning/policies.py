@@ -99,7 +99,7 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
-            name), the id of a published one, or the folder of a run (its best policy).
+            name), the id of a published policy, or the folder of a run (its best policy).
 
     Raises:
         PolicyError: There is no such policy, its files are damaged, or it does not fit ``envs``.
@@ -117,7 +117,7 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
 
 
 def trained_in(spec: str) -> tuple[str, dict[str, Any]] | None:
-    """Return the environment id and its options that a policy was trained with, if any."""
+    """Return environment id and options of a policy's training; None for expert and random."""
     if spec in SCRIPTED:
         return None
     about = _exported(spec).description

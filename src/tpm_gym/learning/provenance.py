@@ -141,8 +141,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file under a temporary name and rename it, so that readers never see a part of it.
 
-    Missing parent folders are made. A link stays, and its target is replaced. ``write`` gets a path
-    with the same suffix.
+    Missing parent folders are made. If ``path`` is a link, the link stays, and its target is
+    replaced. ``write`` is called with the temporary path, which has the same suffix.
     """
     target = _target(path)
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -173,7 +173,7 @@ def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str,
 
 @contextmanager
 def _foreign_named(run: Path) -> Iterator[None]:
-    """Convert errors of a checkpoint whose checksum is right, but whose entries are not."""
+    """Convert errors to a CheckpointError, for a checkpoint with right checksum, wrong entries."""
     try:
         yield
     except TPMError:
@@ -200,7 +200,7 @@ class _Session:
     content: Content | None
 
     def run(self) -> signal.Signals | None:
-        """Train, save and test; return the signal that stopped the training, None without one."""
+        """Train, save and test; return the signal that stopped the training, or None."""
         config, listener = self.config, SignalListener()
         torch.set_num_threads(config.threads)
         count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
@@ -289,7 +289,7 @@ class _Session:
         export.save_archive(model, archive)
 
     def _conclude(self, stopped_by: signal.Signals | None) -> None:
-        """Report how the training ended, and test a policy of the analytic engine."""
+        """Report how the training ended; run the final test if the configuration has one."""
         config = self.config
         if stopped_by is not None:
             command, saved = run_folder.resume_command(config.run), "without a checkpoint"
@@ -302,7 +302,7 @@ class _Session:
             self._test()
 
     def complete(self) -> bool:
-        """Make curve and last test if a kill prevented them; return whether the test was made."""
+        """Draw the curve and run the final test if a kill prevented this; return whether it ran."""
         config = self.config
         if not (config.run / CURVE_FILE).exists():
             evaluations = run_folder.evaluations(config.run)

@@ -160,7 +160,7 @@ class EquationOfMotion(ABC):
 
     @abstractmethod
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Any, Numbers, Numbers]:
-        """Return the configuration at theta, whether it is real, and whether J exists there."""
+        """Return the configuration at theta, whether it exists, and whether J exists there."""
 
     @abstractmethod
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
@@ -177,7 +177,7 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Apply the function ``text`` of a pose and triples to each row of the states."""
+        """Call ``text`` with the pose at theta and the other states; return results of all rows."""
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))

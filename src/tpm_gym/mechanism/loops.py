@@ -9,8 +9,9 @@ A loop takes five arguments:
 * ``machine``: the signs of the modes, then gravity (3), m/s^2.
 * ``results``: a tuple of arrays with n rows, which the loop fills; NaN where there is no solution.
 
-A row does not depend on the others, so it has the same bits alone and among thousands. Rows are
-copied to columns of a block, so that the compiler can compute several rows at a time.
+A row does not depend on the others. So a call with one row and a call with thousands of rows give
+this row equal results, bit for bit. Rows are copied to columns of a block, so that the compiler can
+compute several rows at a time.
 """
 
 import math
@@ -43,14 +44,15 @@ class Equations(NamedTuple):
         modes: (machine) -> signs of the modes.
         lengths: (columns, j) -> lengths of row j.
         inertia: (columns, j) -> constants of the dynamics of row j.
-        posture: (point, modes, lengths) -> joint positions; whether they are real.
-        pose: (joint positions, modes, lengths) -> configuration; whether it is real; whether it is
+        posture: (point, modes, lengths) -> joint positions; whether they exist.
+        pose: (joint positions, modes, lengths) -> configuration; whether it exists; whether it is
             in the working mode.
         position: (configuration) -> point P.
         regular: (configuration, lengths) -> whether J exists.
         velocity: (configuration) -> rows of J.
         same_side: (configuration, point, modes, lengths) -> whether the point is on the assembly
-            mode's side. Use only the arms of the configuration, since the rest may not be real.
+            mode's side. The function may use only the arms of the configuration, since the loops
+            through the rods may not close.
         torques: (configuration, rates, changes, gravity, inertia) -> torques.
         gather: (configuration, force at P) -> torques J^T force.
         masses: (configuration, J, inertia) -> upper triangle of M.
@@ -210,7 +212,11 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         found[12, j] = conditioning(rows, NS) if real else math.nan
 
     def conditioning_at(block: _Block, j: int) -> None:
-        """Compute 1/cond(J) for P; 0 unless the machine's modes reach P within the limit."""
+        """Compute 1/cond(J) for P.
+
+        The result is 0 if P is out of reach, if J does not exist, or if the forward kinematics
+        return a point that differs from P by the limit or more.
+        """
         g, point, limit = lengths(block.own, j), get(block.given, 0, j), block.limit
         angles, reached = posture(point, block.modes, g)
         at, there, _ = pose(angles, block.modes, g)

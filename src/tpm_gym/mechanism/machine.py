@@ -95,14 +95,15 @@ class Machine(ABC):
             the penalty of the reward begins below it.
         table: Half edges of the table along x and y, m; its top is the world's z = 0.
         payload: Mass that a gripper holds at point P, kg; :attr:`mechanism` contains it.
-        mirror_axis: Axis (0, 1, 2) normal to a plane of symmetry through the origin. P may pass
-            this plane, a parallel singularity, into the mirror image of the assembly mode. None for
-            a machine that has to stay in its assembly mode.
+        mirror_axis: Axis (0, 1, 2) normal to a plane of symmetry through the origin. This plane is
+            a parallel singularity, which P may pass; the machine then is in the mirror image of its
+            assembly mode. None for a machine that has to stay in its assembly mode.
 
     Raises:
         ConfigurationError: If a value is not possible, if home or the goals lie outside the region,
-            if the region reaches beyond a singularity, a motor's stop or (by more than the cup's
-            stroke) the table, or if the loops of the mechanism do not close at home.
+            if the region reaches beyond a singularity or a motor's stop, if it reaches below the
+            table by more than the cup's stroke, or if the loops of the mechanism do not close at
+            home.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -144,7 +145,7 @@ class Machine(ABC):
             raise ConfigurationError("mount", self.mount, valid)
 
     def _require_values(self) -> None:
-        """Reject other types and numbers that are not finite; convert arrays to tuples."""
+        """Reject wrong types, and numbers that are not finite; convert arrays to tuples."""
         for name, kind in (("mount", Mount), ("region", Region), ("goal_region", Region)):
             if not isinstance(getattr(self, name), kind):
                 raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
@@ -156,7 +157,12 @@ class Machine(ABC):
         object.__setattr__(self, "table", tuple(table.tolist()))
 
     def _require_usable(self, name: str, points: list[Vector]) -> FloatArray:
-        """Return joint positions (k, 3); reject ``name`` if a point is beyond reach or a limit."""
+        """Return joint positions (k, 3) for points (k, 3) of the attribute ``name``.
+
+        Raises:
+            UnreachableError: If a point is out of reach.
+            ConfigurationError: If a point is beyond a singularity or a motor's stop.
+        """
         try:
             theta, left = self._postures(np.array(points))
         except UnreachableError as error:
@@ -329,13 +335,14 @@ class Machine(ABC):
     ) -> FloatArray:
         """Compute the motors' torques (..., 3) N m (N for a slide) for a motion.
 
-        The base class computes them from the bodies by differences, which takes milliseconds a row.
+        The base class computes the torques from the bodies by finite differences, which takes
+        milliseconds for each row.
 
         Args:
             theta: Joint positions (..., 3).
             theta_dot: Joint velocities (..., 3) per s.
             theta_ddot: Joint accelerations (..., 3) per s^2.
-            force: Force on P (..., 3) N that the motors hold against; None for none.
+            force: Force on P (..., 3) N that the motors hold against; None for no force.
             built: Parameters of the machines, as for :meth:`inverse`.
         """
         motion = np.stack(np.broadcast_arrays(theta, theta_dot, theta_ddot), axis=-2, dtype=float)

@@ -8,9 +8,10 @@ with the gap's radius r and the length L of the iron. Frameless torque motors re
 seconds, and 10 to 20 kPa continuously without a fan. The gap's radius gives the rotor, a ring of
 iron with magnets, whose inertia is not negligible beside the arm's.
 
-The voltage of the amplifier limits the speed. With the motor constant K (N m per root of a watt
-lost in the winding) and the no-load speed w0, the largest torque at a speed w is K^2 (w0 - w). So
-the peak torque T is available up to the corner speed, w0 - T / K^2.
+The voltage of the amplifier limits the speed. The motor constant K is the torque over the square
+root of the power that the winding loses as heat, N m/sqrt(W). With K and the no-load speed w0, the
+largest torque at a speed w is K^2 (w0 - w). So the peak torque T is available up to the corner
+speed, w0 - T / K^2.
 """
 
 from __future__ import annotations

@@ -14,7 +14,8 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 CARBON_FIBRE = 1600.0  # kg/m^3
 SLIDES: Final = ("platform_x", "platform_y", "platform_z")
 TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-"""Revolutes of :func:`free_platform`, always at 0 rad; its SLIDES are at P, m."""
+"""Revolute joints of :func:`free_platform`; their positions are always 0 rad. The positions of its
+SLIDES are the coordinates of P, m."""
 FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 

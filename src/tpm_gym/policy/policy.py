@@ -20,8 +20,8 @@ from tpm_gym.resources import POLICIES
 _BLOCK = 8
 """Rows of a batch that are multiplied at once.
 
-OpenBLAS uses no threads for so few rows. So an action has the same bits alone and in a batch, and
-threads do not slow each other down on a busy computer.
+OpenBLAS uses no threads for so few rows. So an observation gives the same action, bit for bit,
+alone or in a batch, and threads do not slow each other down on a busy computer.
 """
 
 
@@ -34,7 +34,7 @@ def load_policy(path: str | Path) -> Policy:
             file exists.
 
     Raises:
-        InputError: ``path`` is neither a str nor a Path, or empty.
+        InputError: ``path`` is empty, or is neither a str nor a Path.
         PolicyFileError: A file is missing or is not that of a policy, or ``path`` is an archive of
             Stable-Baselines3, which only unpickling could read.
         MissingPackageError: safetensors or pydantic is not installed.

@@ -564,7 +564,7 @@ def _turn(index: int, state: State) -> FloatArray:
 
 
 def _columns(entries: Sequence[Entry]) -> Any:
-    """Return an index of the columns of entries that share a source."""
+    """Return the index that selects the columns of entries from the array of their source."""
     if entries[0].columns is None:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]

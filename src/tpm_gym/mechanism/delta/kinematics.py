@@ -94,7 +94,7 @@ def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) 
 
 
 def factors(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> Factors:
-    """Compute the factors that are zero at singularities, without a unit."""
+    """Compute the factors that are zero at singularities; the factors have no unit."""
     require_delta(geometry)
     require_side(side)
 
@@ -154,7 +154,7 @@ def reachable(
 
 
 def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
-    """Explain which leg does not reach a point (3) m, and by how much."""
+    """Explain which leg does not reach a point (3,) m, and by how much."""
     legs, inner = [inwards(leg, point) for leg in (ONE, TWO, THREE)], geometry.l2 - geometry.l1
     margins = [leg_margin(level + inner, up, out, geometry) for level, out, up in legs]
     worst = margins.index(min(margins))
@@ -165,7 +165,7 @@ def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
 def no_assembly(
     theta: Vector, side: float, geometry: DeltaGeometry
 ) -> UnreachableError | SingularityError:
-    """Explain why the Delta cannot be assembled at theta (3) rad, or has no velocity."""
+    """Explain why the Delta, at theta (3,) rad, has no assembly, no J or another working mode."""
     with np.errstate(all="ignore"):
         cos, sin = arms_at(tuple(map(np.float64, theta)), geometry, NUMPY)
         position, real, height2 = assembly_at(cos, sin, side, geometry, NUMPY)

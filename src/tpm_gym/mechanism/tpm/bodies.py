@@ -173,7 +173,7 @@ def joint_angles(
 
     Raises:
         InputError: If theta (3,) rad has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist at theta.
+        UnreachableError: If the assembly mode ``branch`` does not exist at theta.
     """
     angles = joint_arrays(vector("theta", theta), branch, geometry)
     return {name: float(angle) for name, angle in angles.items()}
@@ -197,11 +197,11 @@ def joint_arrays(
 def rotated_joint_angles(
     theta: ArrayLike, branch: RotatedMode, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints, rad, on a branch of the rotated operation mode.
+    """Compute the angles of all joints, rad, in an assembly mode of the rotated operation mode.
 
     Raises:
-        InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
-            at theta.
+        InputError: If theta has the wrong shape or is not finite, or if the assembly mode
+            ``branch`` does not exist at theta.
     """
     angles = vector("theta", theta)
     found, slot = forward_rotated(angles, geometry), branch.index

@@ -1,8 +1,8 @@
 """TPM that works on both sides of y = 0.
 
 Inverse kinematics and dynamics are even functions of y. So a posture and its mirror image in the
-plane y = 0, a parallel singularity, have equal joint positions, inertia and torques. They differ in
-the assembly mode, and so in the sign of y in the forward kinematics.
+plane y = 0 have equal joint positions, inertia and torques. They differ in the assembly mode, and
+so in the sign of y in the forward kinematics. The plane y = 0 is a parallel singularity.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def both_sides(machine: Machine) -> BothSides:
     Its region is the smallest box around the region of ``machine`` and the region's mirror image.
 
     Raises:
-        ConfigurationError: If the machine is no TPM, or not in its modes in the whole region.
+        ConfigurationError: If the machine is no TPM, or if it is not in its modes at a corner of
+            the region or at a point next to y = 0.
         UnreachableError: If a corner of the region, or a point next to y = 0, cannot be reached.
     """
     if not isinstance(machine, TPM):

@@ -148,7 +148,10 @@ def collide_objects(
 def _collide_table(
     box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
-    """Add contacts of corners with table or belt; with the floor if the centre is over neither."""
+    """Add contacts of a box's corners with the table or belt.
+
+    If the box's centre is over neither of them, add contacts with the floor instead.
+    """
     (x, y, z), (count, slot), (low, high, edge) = box.middle, place, setting.table
     over = low <= x <= high and abs(y) <= edge
     height = z - (TABLE.top if over else FLOOR.top)
@@ -421,7 +424,10 @@ def _clip_face(
 
 @compiled
 def _cut(points: FloatArray, kept: FloatArray, number: int, side: Vector, edge: float) -> int:
-    """Clip a polygon to distances up to ``edge`` along ``side``; return the number of corners."""
+    """Keep the part of a polygon with coordinates up to ``edge`` (m) along the direction ``side``.
+
+    Write the corners of this part to ``kept``; return their number.
+    """
     left = 0
     for k in range(number):
         here, there = three(points[k]), three(points[(k + 1) % number])
