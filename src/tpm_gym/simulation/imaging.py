@@ -144,8 +144,8 @@ class View(NamedTuple):
         camera: Camera, in the world frame.
         width: Width, pixels.
         height: Height, pixels.
-        segmented: Whether the picture includes the ids of bodies. The depth then has the edges of
-            these bodies; otherwise its edges may be smoothed.
+        segmented: Whether the picture includes the ids of bodies. Edges in the depth are then
+            sharp, at the same pixels as edges of the ids; otherwise they may be smoothed.
     """
 
     camera: Camera

@@ -330,7 +330,8 @@ class Simulation:
         Joint positions are equal on both sides of the plane, so encoders do not show the side. The
         sign of a passive joint shows it. A switch would measure this sign on a real robot.
 
-        If P did not follow its path through the plane, the commands are mirrored too. This does not
+        P may turn back at the plane although its path passes the plane. If P and the end of its
+        path are then on different sides of the plane, the commands are mirrored too. This does not
         change the joint positions on the path.
 
         Args:

@@ -1,6 +1,6 @@
 """Viewer in the browser: postures, modes, singular surfaces, and episodes of any task.
 
-Needs the extra ``view``. Importing this package does not import viser.
+The viewer needs the extra ``view``. Importing this package does not import viser.
 """
 
 from __future__ import annotations

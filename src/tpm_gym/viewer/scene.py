@@ -102,7 +102,7 @@ class RobotScene:
         self._poses = poses
 
     def set_objects(self, scene: Scene, tolerance: float) -> None:
-        """Replace objects, goal markers, belt and paint by the task's."""
+        """Replace objects, goal markers (radius: ``tolerance``, m), belt and paint by a task's."""
         for name in _TASK:
             self._scene.remove_by_name(name)
         patches = painted(scene)

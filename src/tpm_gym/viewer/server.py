@@ -20,7 +20,7 @@ _TAKEN = errno.EADDRINUSE, errno.EACCES
 
 
 def start(host: str, port: int) -> ViserServer:
-    """Start a server at the port, or at the next free one; at any free one if the port is 0.
+    """Start a server at the port or the next free port; for port 0, at any free port.
 
     Raises:
         ConfigurationError: If the address is not this computer's, or the port is not possible.
