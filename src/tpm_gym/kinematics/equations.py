@@ -1,16 +1,17 @@
 """Closed-form equations of the mechanism, for floats, arrays and tensors.
 
-The paper's frame O-xyz: origin in the middle of the base, base plane z = 0, z from the base towards
-the platform; metres and radians. The mechanism has two loops of coupling degree zero, so forward
-and inverse kinematics reduce to intersections of circles. These are solved as vectors and as
-``a cos + b sin = c``, not with the paper's half-angle forms (Eqs. 13 and 15), which break where
-``g_i = 0`` or ``theta_i = pi``.
+The paper's frame O-xyz has its origin in the middle of the base. The base lies in the plane z = 0,
+and z points from the base towards the platform. Units are metres and radians. The mechanism has two
+loops of coupling degree zero, so forward and inverse kinematics reduce to intersections of circles.
+These are solved as vectors and as ``a cos + b sin = c``. The paper's half-angle forms (Eqs. 13 and
+15) are not used, because they fail where ``g_i = 0`` or ``theta_i = pi``.
 
 The functions compute with the numbers of their namespace ``ns``: arrays and tensors
 (:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code
 (:mod:`tpm_gym.kinematics.compiled`). Components (x, y, z or theta_1 to theta_3) are separate
 numbers (...,), and signs of branches broadcast with them. The functions check and raise nothing.
-Beside a solution they return whether it is real, and the lengths that explain why it is not.
+Besides a solution, they return whether the solution is real, and the lengths that explain why it is
+not real.
 """
 
 import math
@@ -34,7 +35,7 @@ SINGULAR = 1e-6
 paper's lengths, this is 50 nm in y. cos(beta) has an error of about 1e-14. So near cos(beta) = 1,
 sin(beta) has an error of about 1e-7, which is below the limit."""
 LEAST = 1e-30
-"""Smallest det A, m^3, for which the conditioning is computed. For a smaller one, terms of the
+"""Smallest det A, m^3, for which the conditioning is computed. For a smaller det A, terms of the
 conditioning could overflow."""
 
 _TINY = sys.float_info.min  # the smallest divisor
@@ -48,15 +49,15 @@ class LegLengths(Protocol):
 
     @property
     def l3(self) -> Numbers:
-        """Arms A_iB_i."""
+        """Length of the arms A_iB_i."""
 
     @property
     def l4(self) -> Numbers:
-        """Rods B_iC_i."""
+        """Length of the rods B_iC_i."""
 
 
 class Assembly(NamedTuple):
-    """The mechanism assembled at three actuated angles: P and C1 in m, and link 7's direction."""
+    """Mechanism assembled at three actuated angles: P and C1, m, and the direction of link 7."""
 
     x: Numbers
     y: Numbers
@@ -70,14 +71,16 @@ class Assembly(NamedTuple):
 class Factors(NamedTuple):
     """Factors of det A (Eq. 16, corrected) and of det B (Eq. 17, corrected), and the elevation.
 
-    A configuration is singular where one of them is zero.
+    A configuration is singular where a factor or the elevation is zero.
 
     Attributes:
-        level3: l1 + l3 c3 - xC - 2 l2, m.
-        planar: Zero where B1C1 and B2C2, projected on y = 0, line up, m^2.
-        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad: zero where the leg is stretched or folded.
-        elevation: z_C1 - z_B1, m: where it is zero, the rods of the 4S parallelogram no longer keep
-            link 3' from turning about y, a constraint singularity.
+        level3: l1 + l3 cos(theta_3) - xC - 2 l2, m.
+        planar: Cross product, m^2, of B1C1 and B2C2 projected on y = 0; zero where they line up.
+        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad; zero where leg 1 is stretched or folded.
+        leg2: B_2C_2 . dB_2/dtheta_2, m^2/rad.
+        leg3: B_3C_3 . dB_3/dtheta_3, m^2/rad.
+        elevation: z_C1 - z_B1, m. At zero, a constraint singularity, the rods of the 4S
+            parallelogram no longer keep link 3' from turning about y.
     """
 
     sin_beta: Numbers
@@ -115,9 +118,11 @@ def assembly_at(
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers, Numbers]]:
     """Solve forward kinematics (Eqs. 6 to 11, corrected) for signs of planar factor and sin(beta).
 
-    Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
-    (dx, z1 + dz) with radius l4. The intersection on the left of the line from the first to the
-    second centre has a positive planar factor, the other intersection a negative one.
+    Eq. (6): in the plane y = 0, C1 is on two circles. With the elbow B1 at (0, y1, z1), the first
+    circle has the centre (0, z1) and radius^2 = l4^2 - y1^2. The second circle has the centre
+    (dx, z1 + dz), which is the elbow B2 displaced by 2 l5 along x, and the radius l4. The
+    intersection on the left of the line from the first to the second centre has a positive planar
+    factor, the other intersection a negative one.
 
     Returns:
         The assembly, whether it is real, and five values that explain why it is not. In this order,
@@ -205,7 +210,7 @@ def arm(
         ns: Namespace.
 
     Returns:
-        The angle, and whether the leg reaches.
+        The angle, and whether the leg reaches C.
     """
     l3, l4 = g.l3, g.l4
     radius2 = a * a + b * b
@@ -304,7 +309,7 @@ def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
     """Compute the largest singular value of M, the root of the largest eigenvalue of M M^T.
 
-    The eigenvalues are the trigonometric roots of the characteristic polynomial.
+    The eigenvalue comes from the trigonometric formula for the characteristic polynomial's roots.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     xx, yy, zz = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
@@ -357,7 +362,7 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 
 
 def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
-    """Return the margin by which a leg reaches, m; negative if it does not.
+    """Return the margin by which a leg reaches C, m; negative if the leg does not reach C.
 
     Args:
         level: Horizontal distance of C from A in the arm's plane, m.

@@ -1,9 +1,9 @@
-"""Jacobians, their singular factors, and conditioning, batched, in the paper frame.
+"""Jacobians, their singular factors, and conditioning, for batches, in the paper frame.
 
-With f_i = |B_iC_i|^2 - l4^2 = 0 and the platform velocity v, differentiation gives
-A v = B theta_dot (section "Singularity analysis"). Configurations are given by the actuated angles
-``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and the
-working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
+The closures are f_i = |B_iC_i|^2 - l4^2 = 0. Their derivatives by time are A v = B theta_dot, with
+the platform's velocity v (section "Singularity analysis"). Configurations are given by the actuated
+angles ``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and
+the working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
 
 All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions of angles
 also raise InputError if theta is not finite, and UnreachableError if the assembly mode does not
@@ -178,7 +178,7 @@ def factors(
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
-    """Compute the factors at points, accurately at singularities too; NaN where out of reach."""
+    """Compute the factors at points, which are accurate at singularities too; NaN out of reach."""
     return Factors(*_from_points(lambda c: c.factors, position, branch, geometry, math.nan))
 
 
@@ -252,7 +252,7 @@ def _velocity(c: _Configuration) -> Numbers:
 
 
 def _conditioning(c: _Configuration) -> Numbers:
-    """Compute the conditioning, and 0 where J does not exist."""
+    """Compute the conditioning; 0 where J does not exist."""
     values, ns = c.factors, c.ns
     exists = abs(values.planar * values.sin_beta * values.level3) > equations.LEAST
     # Otherwise, the derivatives of all rows by the lengths would be NaN.

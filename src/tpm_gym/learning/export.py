@@ -28,7 +28,7 @@ from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-4
-"""Largest error of an exported action, relative to half its range or to 1, whichever is larger.
+"""Largest error of an exported action, divided by the larger of 1 and half the action's range.
 
 Single precision rounds the actions of networks with large weights by 1e-5. Wrong weights or a wrong
 activation cause far larger errors.
@@ -96,7 +96,7 @@ def save(
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model as an archive of Stable-Baselines3; readers never see a part of the file."""
+    """Save a model as an archive of Stable-Baselines3; no reader sees an incomplete file."""
     file = io.BytesIO()  # PyTorch itself, writing to a full disk, would hide the error
     model.save(file)
     provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))

@@ -36,7 +36,7 @@ def write_video(path: Path, play: Play, fps: float) -> None:
 
 
 def write_contact_sheet(path: Path, play: Play, fps: float) -> None:
-    """Write a PNG of the six moments of an episode that differ most, each above its time."""
+    """Write a PNG of the six most different moments of an episode, with the time below each."""
     frames: list[Frame] = []
     play(frames.append)
     sheet = contact_sheet({f"{k / fps:.3g} s": frames[k] for k in _moments(frames)}, _COLUMNS)
@@ -44,7 +44,7 @@ def write_contact_sheet(path: Path, play: Play, fps: float) -> None:
 
 
 def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
-    """Draw equally large pictures row by row, each above its caption."""
+    """Draw equally large pictures row by row, with a caption below each picture."""
     from PIL import Image, ImageDraw, ImageFont
 
     height, width, _ = next(iter(pictures.values())).shape

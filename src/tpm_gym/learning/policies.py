@@ -81,7 +81,7 @@ class NoisyPolicy:
     rngs: list[np.random.Generator] = field(default_factory=list)
 
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
-        """Reset the policy, and seed a generator for each episode, as :class:`RandomPolicy`."""
+        """Reset the policy; seed a generator for each episode as :class:`RandomPolicy` does."""
         self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
         self.policy.reset(observation, seeds)
 

@@ -101,7 +101,7 @@ def require_packages(extras: Mapping[str, str]) -> None:
 
 
 def require_writable(option: str, path: Path) -> None:
-    """Make the folder of a file that will be written later, and check that it can be written."""
+    """Make the folder of a file that will be written later; check that the file can be written."""
     problem = None
     try:
         if path.is_dir():
@@ -139,7 +139,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under a temporary name and rename it, so that readers never see a part of it.
+    """Write a file under a temporary name and rename it, so that no reader sees an incomplete file.
 
     Missing parent folders are made. If ``path`` is a link, the link stays, and its target is
     replaced. ``write`` is called with the temporary path, which has the same suffix.

@@ -251,7 +251,7 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Restore the unfinished episodes; refuse if they do not end in the same observations."""
+    """Restore the unfinished episodes; refuse if they do not end in the saved observations."""
     envs: Any = model.env
     last = starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):
@@ -280,7 +280,7 @@ def _pending(content: Content) -> dict[str, NDArray[Any]]:
 
 
 class _Log(Logger):
-    """Log in which iterations count from the beginning of the run, not of the process."""
+    """Logger that counts iterations from the beginning of the run, not of the process."""
 
     earlier = 0
 

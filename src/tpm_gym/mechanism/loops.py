@@ -37,8 +37,8 @@ class Equations(NamedTuple):
     """Functions of one mechanism that the loops call; all of them are compilable.
 
     Each attribute is given as (arguments) -> results. ``columns`` hold lengths and constants of the
-    machines; functions return those of row j. ``rates`` and ``changes`` are the first and second
-    derivatives of the joint positions by time.
+    machines; functions return the values of row j. ``rates`` and ``changes`` are the first and
+    second derivatives of the joint positions by time.
 
     Attributes:
         modes: (machine) -> signs of the modes.

@@ -84,7 +84,7 @@ def site_names(closure: str) -> tuple[str, str]:
 
 
 def mjcf_text(machine: Machine) -> str:
-    """Write the robot over a table, with servos as motors, for MuJoCo without tpm_gym."""
+    """Write MJCF for MuJoCo without tpm_gym: the robot over a table, with servos as motors."""
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))

@@ -108,9 +108,9 @@ def in_world(
         origin: (3,) m, origin of the machine's frame in the world frame.
 
     Returns:
-        P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, z axes (n, k, 3) of the objects;
-        world frame. Whether the assembly mode and the working mode was left, (n,). Whether all
-        loops are closed.
+        Four arrays in the world frame: P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, and
+        z axes (n, k, 3) of the objects. Two arrays (n,): whether the assembly mode was left, and
+        whether the working mode was left. A bool: whether all loops are closed.
     """
     place, speed = np.empty_like(position), np.empty_like(position)
     wanted, axes = np.empty_like(position), np.empty((*quaternion.shape[:2], 3))

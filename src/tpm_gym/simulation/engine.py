@@ -352,7 +352,7 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
 
 
 def _path(engine: str | Factory) -> str:
-    """Return "module:attribute" of an engine; it shows whether two registrations are equal."""
+    """Return "module:attribute" of an engine, to compare two registrations."""
     if isinstance(engine, str):
         return engine
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"

@@ -44,8 +44,8 @@ class Camera:
         distance: Distance from the target, m.
         yaw: Rotation about the vertical, degrees; at 0 the camera looks along +y.
         pitch: Angle above the horizon, degrees; negative to look down.
-        opening: Vertical field of view of a picture of 4:3 or wider, degrees. Narrower pictures
-            keep the horizontal field of view of 4:3.
+        opening: Vertical field of view, degrees, of a picture with an aspect ratio of 4:3 or more.
+            Narrower pictures have the horizontal field of view of a picture of 4:3.
         follows: Whether ``target`` is relative to point P of the platform.
 
     Raises:

@@ -10,7 +10,7 @@ from tpm_gym.kinematics.namespaces import Numbers
 
 
 class DeltaLengths(NamedTuple):
-    """Lengths l1 to l5 as any kind of numbers, such as tensors; they are not checked."""
+    """Lengths l1 to l5, m, as any kind of numbers, such as tensors, without checks."""
 
     l1: Numbers
     l2: Numbers
@@ -25,9 +25,9 @@ class DeltaGeometry:
 
     Attributes:
         l1: Radius of the base: distance from O to each actuated pivot A_i.
-        l2: Radius of the platform: distance from P to C_i. May be zero.
-        l3: Actuated arms A_iB_i.
-        l4: Rods B_iC_i.
+        l2: Radius of the platform: distance from P to C_i; may be zero.
+        l3: Length of the actuated arms A_iB_i.
+        l4: Length of the rods B_iC_i.
         l5: Half the distance between the two rods of a leg. It does not change the kinematics.
 
     Raises:

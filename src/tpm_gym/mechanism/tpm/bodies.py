@@ -1,7 +1,7 @@
 """The mechanism from a Geometry: links, joints, inertias and loop closures.
 
-Some physics engines need a tree of links, so the loops are cut. This is the spanning tree, with
-the paper's numbers of links (Fig. 1):
+Some physics engines need a tree of links, so the loops are cut. The spanning tree, with the paper's
+numbers of links (Fig. 1), is:
 
     base 0 - arm 2  - two rods 4                                        (branch I, the 4S rods)
     base 0 - arm 5  - rod 6 - link 3' - link 7 - platform 1 - end link 10   (branch II, platform)
@@ -11,9 +11,9 @@ Four ball joints close the loops. They connect the far ends of rods 4 to link 3'
 of rods 11 to end link 10. A rod with a ball joint at both ends could spin about its own axis. So
 rods 4 have a universal joint at the arm instead. Rods 11 turn on the paper's revolutes R_e and R_f.
 R_g and R_h are ball joints here, since revolutes would add redundant constraints. So end link 10, a
-straight bar through both of them, can roll about its own axis.
+straight bar through these two ball joints, can roll about its own axis.
 
-All frames are parallel to the paper frame when all joints are at zero: arms and rods then point
+When all joints are at zero, all frames are parallel to the paper frame, and arms and rods point
 along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 """
 

@@ -192,7 +192,8 @@ def accelerations(
     """Compute accelerations, m/s^2, from the second derivatives of the closures.
 
     Returns:
-        B1 along y and z, B2 and B3 along x and z; C1 along x and z; P.
+        Accelerations of B1 along y and z, of B2 and B3 along x and z, of C1 along x and z, and of
+        P.
     """
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (_, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = pose.rods

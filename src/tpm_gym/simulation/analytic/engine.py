@@ -39,7 +39,8 @@ from tpm_gym.simulation.state import Scene
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _NEAR_PLANE = 1.2
-"""Distance from the plane of ``mirror_axis``, divided by the machine's step limit.
+"""Distance of P from the plane of symmetry normal to ``mirror_axis``, divided by the machine's
+``step_limit`` (m) along this axis.
 
 Beyond this distance, torques are computed from differences of joint positions. At this distance
 and at full speed, these differences have an error of 0.2 m/s^2 in P's acceleration normal to the
@@ -62,8 +63,8 @@ class AnalyticEngine:
         drive: Servo drives of the motors; None for ideal drives.
 
     Attributes:
-        least_steps: Smallest number of time steps in a control period. Accelerations are found from
-            the last three points of a path.
+        least_steps: Smallest number of time steps in a control period, because accelerations are
+            computed from the last three points of a path.
         torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
             ``physics.torques`` is ``"every"``.
 

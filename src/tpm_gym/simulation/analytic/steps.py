@@ -99,8 +99,10 @@ def ideal_push(
 
     Args:
         theta: (r, 3) rad, joint positions at the beginning of the time step.
-        rates: (r, 3) rad/s, joint velocities at the end of the time step without torques.
-        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes plus their compliance.
+        rates: (r, 3) rad/s, joint velocities that the time step would end with if the torques were
+            zero.
+        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes, plus the compliance of
+            the motors.
         torque: (r, 3) N m, output.
     """
     for row in range(len(effort)):

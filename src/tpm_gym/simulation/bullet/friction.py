@@ -17,9 +17,10 @@ pushes leans on the lip only because the table brakes it. In a solution without 
 the solver allows no friction at the lip. So this module computes the missing friction from the last
 N, and adds it as a force.
 
-Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
-by one time step. The smaller scale never falls below :data:`_LEAST`. A level contact between two
-objects has the friction box while it sticks, and in the first time step of a slide.
+Some errors remain (measured in ``tests/simulation/test_friction.py``). The scales and the added
+forces lag by one time step, since they are computed from the last one. The smaller scale never
+falls below :data:`_LEAST`. A level contact between two objects has the friction box while it
+sticks, and in the first time step of a slide.
 """
 
 from __future__ import annotations
@@ -49,10 +50,10 @@ _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction o
 _BOX = (1.0, 1.0)  # Bullet's default scales
 _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
-"""Friction that was added to a contact in a time step, N.
+"""Friction that was added to a contact in a time step: two entries, N.
 
-The two values are the second part of the force (see ``compiled.friction_force``), and the largest
-force that could be added.
+The first entry is the second part of the force (``compiled.friction_force`` explains both parts).
+The second entry is the size of the largest force that could be added.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
@@ -400,7 +401,7 @@ def _smaller(one: float, other: float) -> float:
 def _scales(
     slips: Sequence[_Slip], points: Sequence[Any], coefficient: float
 ) -> tuple[float, float]:
-    """Return the friction limits along x and y (world) in units of mu N.
+    """Return the friction limits along x and y (world), divided by mu times the normal force.
 
     Points of a spinning object slip in different directions, but share the scales.
 
@@ -433,7 +434,7 @@ def _along(x: float, y: float) -> tuple[float, float]:
 
 
 def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Return the sum of friction forces along the world's x and y, in units of mu N."""
+    """Return the total friction along x and y (world), divided by mu times the normal force."""
     along_x, along_y, _ = map(sum, zip(*map(_solved, points), strict=True))
     most = coefficient * sum(point[9] for point in points)
     return (along_x / most, along_y / most) if most > 0 else (0.0, 0.0)
