@@ -93,7 +93,7 @@ def _costs(record: dict[str, Any]) -> str:
     return (
         f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; "
         f"{'; '.join(ratios)} (median and quartiles of rounds in which the engines take turns). "
-        f"Energy that a fall of 0.16 s with the motors off loses: {lost}."
+        f"Energy lost in a fall of 0.16 s, with the motors off: {lost}."
     )
 
 

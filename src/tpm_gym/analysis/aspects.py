@@ -253,9 +253,10 @@ def _codes(
 def _signs(
     points: FloatArray, branch: WorkingMode, geometry: Geometry, limits: tuple[Limit, ...]
 ) -> IntArray:
-    """Return the signs of four factors as bits; -1 at points out of reach or beyond a limit.
+    """Return the signs of four singular factors as bits; -1 out of reach or beyond a limit.
 
-    The bits 1, 2, 4 and 8 are set if sin(beta), level3, planar and elevation are positive.
+    The bits 1, 2, 4 and 8 are set where ``sin_beta``, ``level3``, ``planar`` and ``elevation`` of
+    :class:`~tpm_gym.kinematics.Factors` are positive.
     """
     found = factors_at(points, branch, geometry)
     values = np.stack([found.sin_beta, found.level3, found.planar, found.elevation], axis=-1)

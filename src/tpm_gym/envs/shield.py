@@ -209,8 +209,8 @@ class BrakingShield:
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
         """Return safe commands (n, 3) m between the braking commands and the wanted ones.
 
-        If even braking leads below ``least``, the smallest conditioning with the returned command
-        is no smaller than with braking.
+        If even braking leads to a conditioning below ``least``, the returned command is no worse:
+        the smallest conditioning on its path is at least that on the path of braking.
 
         Args:
             wanted: (n, 3) m, commands by control and follower, machine's frame.

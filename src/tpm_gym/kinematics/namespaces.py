@@ -33,7 +33,7 @@ class Namespace:
         arcsin: Arcsine of the clipped number.
         cos_third: Cosine of a third of the arccosine of the clipped number.
         positive: Angle in [0, 2 pi) from an angle in [-pi, pi].
-        signs: Numbers -1 and 1 in a given shape, with the type of a given number.
+        signs: The two numbers -1 and 1, in a given shape, with the type of a given number.
         stack: Components (...,) joined along a new last axis.
         join: Points (..., 3) broadcast with each other, and joined along their last axis.
         solve: Solutions of linear systems (..., k, k) for right sides (..., k).

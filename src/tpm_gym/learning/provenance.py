@@ -75,7 +75,7 @@ def machine() -> dict[str, Any]:
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return a command that repeats this process, without folders outside the working directory."""
+    """Return a command that repeats this process; see :func:`_portable` for the paths in it."""
     program, *words = sys.argv if arguments is None else arguments
     # ``python -m tpm_gym.learning`` is the same command.
     ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).parent / "__main__.py"

@@ -34,7 +34,7 @@ _NONE: Final = (0.0, 0.0, 0.0)
 
 
 class Equations(NamedTuple):
-    """Functions of one mechanism that the loops call; all of them are compilable.
+    """Functions of one mechanism, called by the loops over rows; all of them are compilable.
 
     Each attribute is given as (arguments) -> results. ``columns`` hold lengths and constants of the
     machines; functions return the values of row j. ``rates`` and ``changes`` are the first and

@@ -143,7 +143,7 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Return the factor of the times at which a motor reaches a limit, by bisection."""
+    """Return by which factor all times must grow so that no motor exceeds a limit, by bisection."""
 
     def fits(factor: float) -> bool:
         found = torques / factor**2 + rest

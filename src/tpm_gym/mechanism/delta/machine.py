@@ -120,6 +120,6 @@ DELTA = Delta(
     goal_region=Region(low=(-0.17, -0.17, 0.90), high=(0.17, 0.17, 1.16)),
     home=(0.0, 0.0, 1.03),
 )
-"""Machine with the lengths of ABB's IRB 360, upside down over a table like the TPM."""
+"""Machine with the lengths of ABB's IRB 360. Like the TPM, it hangs upside down over a table."""
 
 register_machine("delta", DELTA)
