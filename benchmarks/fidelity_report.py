@@ -42,7 +42,8 @@ LEGEND = (
     "distance where 1/cond(J) is smaller. Track is the distance of the platform from its "
     "reference. These columns are in mm, tilt is in degrees. Mean, 99.9% "
     "and max are those of all time steps of the three motions. Cost is the CPU time of "
-    "stepSimulation and the motor commands, with the robot alone in the scene. The ratio compares the cost of a control period with that of the default "
+    "stepSimulation and the motor commands, with the robot alone in the scene. "
+    "The ratio compares the cost of a control period with that of the default "
     "in the same round of timing."
 )
 
