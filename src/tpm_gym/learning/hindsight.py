@@ -53,7 +53,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     def _goal_independent_reward(
         self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Return r - R(ag', g) of stored transitions, which is minus the weighted penalty, (n,)."""
+        """Return r - R(ag', g) of stored transitions, (n,): the penalty with a negative sign."""
         assert self.env is not None  # as in the parent
         achieved = self.next_observations["achieved_goal"][batch_indices, env_indices]  # (n, 3) m
         desired = self.next_observations["desired_goal"][batch_indices, env_indices]  # (n, 3) m

@@ -52,8 +52,8 @@ class RandomPolicy:
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
         """Seed a generator for each episode with the episode's seed and a constant.
 
-        The environment draws its goal from a generator that has the seed alone. Actions from an
-        equal generator would depend on the goal.
+        The environment draws its goal from a generator that is seeded with the episode's seed only.
+        Actions from a generator with this seed would depend on the goal.
         """
         self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
 

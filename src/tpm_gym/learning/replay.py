@@ -60,7 +60,7 @@ class _Moments(BaseCallback):
 def episodes(
     env: str, options: EnvOptions, seed: int, count: int, steps: int, record: Record
 ) -> list[Any]:
-    """Train a policy; return ``count`` episodes that ``record`` plays with it during the training.
+    """Train a policy, play episodes with it at several moments of the training, and return them.
 
     Args:
         env: Id, or ``module:id``.
@@ -68,7 +68,8 @@ def episodes(
         count: Number of episodes, spread evenly over the moments.
         seed: Seed of the training, and of the first episode.
         steps: Steps of the training; UNSET for the recipe's number.
-        record: Called with environments, policy, number of episodes and first seed.
+        record: Function that plays the episodes of a moment. Its arguments are environments,
+            policy, number of episodes and first seed.
     """
     config = complete(TrainingConfig(env=env, seed=seed, steps=steps, env_options=options))
     torch.set_num_threads(config.threads)

@@ -1,4 +1,4 @@
-"""Recipes for rl-baselines3-zoo.
+r"""Recipes for rl-baselines3-zoo.
 
     python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
         --gym-packages tpm_gym --conf-file tpm_gym.learning.zoo

@@ -84,7 +84,7 @@ class Solid:
 
     @property
     def rotation(self) -> FloatArray:
-        """Matrix (3, 3) that turns a box, or a cylinder along z, to its place in the link."""
+        """Matrix (3, 3) that turns a box, or a cylinder along z, to its orientation in the link."""
         turn = rotation_of(self.rpy)
         return turn if self.kind == "box" else turn @ rotation_of(ALONG[self.axis])
 

@@ -1,4 +1,4 @@
-"""Machines whose equations are compiled: loops over rows of robots.
+"""Machines whose equations are computed by compiled loops over many robots.
 
 The loops (:mod:`tpm_gym.mechanism.loops`) are imported at the first computation, since they import
 Numba.

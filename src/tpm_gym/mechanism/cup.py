@@ -16,7 +16,7 @@ _SILICONE = 1150.0  # kg/m^3
 
 
 class VacuumCup(NamedTuple):
-    """A cup on a spring-loaded plunger, a level compensator.
+    """Vacuum cup on a spring-loaded plunger, which makers of cups call a level compensator.
 
     Attributes:
         length: Distance from point P of the platform to the lip, m.

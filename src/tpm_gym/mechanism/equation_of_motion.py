@@ -178,7 +178,11 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Call ``text`` with the pose at theta and the other states; return results of all rows."""
+        """Call the function ``text`` with the pose at theta and with the other states.
+
+        Returns:
+            Results of ``text`` for all rows.
+        """
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))

@@ -31,14 +31,15 @@ _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
 
 class Swing(NamedTuple):
-    """Inertia of a leg that its bars do not contain: T = (fixed + spin out^2) rate^2 / 2.
+    """Part of a leg's inertia that is not in the leg's bars.
 
-    The swing is the rotation of the rods in the plane of the arm. ``rate`` is the angular velocity
+    The swing is the rotation of the rods in the plane of the arm. This part of the inertia has the
+    kinetic energy T = ``(fixed + spin * out**2) * rate**2 / 2``. ``rate`` is the angular velocity
     of the swing, rad/s, and ``out`` is the component of BC along the axis of the swing, m.
 
     Attributes:
         fixed: Moment of inertia about the axis of the swing, kg m^2.
-        spin: Moment of inertia of the rods about their own axes, over l4^2, kg.
+        spin: Moment of inertia of the rods about their own axes, divided by l4^2, kg.
     """
 
     fixed: Numbers
@@ -70,7 +71,7 @@ class Bodies:
     """Moving links by name, with factors of their masses, and a record of the links in use."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Set factors of mass and inertia, one for each moving link; empty if all are 1.
+        """Set one factor of mass and inertia for each moving link; without factors, all are 1.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.

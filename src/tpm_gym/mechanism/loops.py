@@ -1,4 +1,4 @@
-"""Compiled loops over rows of a mechanism's kinematics and dynamics.
+"""Compiled loops over rows, which compute a mechanism's kinematics and dynamics.
 
 A loop takes five arguments:
 
@@ -51,8 +51,8 @@ class Equations(NamedTuple):
         regular: (configuration, lengths) -> whether J exists.
         velocity: (configuration) -> rows of J.
         same_side: (configuration, point, modes, lengths) -> whether the point is on the assembly
-            mode's side. The function may use only the arms of the configuration, since the loops
-            through the rods may not close.
+            mode's side. The function may use only the arms of the configuration, since the
+            mechanism may have no assembly.
         torques: (configuration, rates, changes, gravity, inertia) -> torques.
         gather: (configuration, force at P) -> torques J^T force.
         masses: (configuration, J, inertia) -> upper triangle of M.
@@ -87,7 +87,7 @@ def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) ->
 def _place(
     columns: FloatArray, j: int, position: Triple, rows: tuple[Triple, Triple, Triple], real: bool
 ) -> None:
-    """Write P and the rows of J to the first 12 columns of row j; NaN if not ``real``."""
+    """Write P and the rows of J to the first 12 columns of row j; NaN if there is no solution."""
     _put(columns, 0, j, position, real)
     _put(columns, 3, j, rows[0], real)
     _put(columns, 6, j, rows[1], real)
@@ -97,8 +97,8 @@ def _place(
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
     """Fill the columns ``own`` with the machine parameters of ``count`` rows from ``start`` on.
 
-    Each machine has ``each`` rows. If all rows belong to one machine, only the first block fills
-    the columns, and all blocks use them.
+    ``each`` is the number of rows of one machine. If all rows belong to one machine, only
+    the first block fills the columns, and all blocks use them.
     """
     if start == 0 or len(built) > 1:
         for j in range(count):

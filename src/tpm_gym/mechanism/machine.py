@@ -229,7 +229,10 @@ class Machine(ABC):
         return np.ones(np.shape(position)[:-1], dtype=np.bool_)
 
     def mirrored(self) -> Machine:
-        """Return the machine with home and assembly mode beyond the plane of ``mirror_axis``."""
+        """Return the machine with its home and its assembly mode mirrored.
+
+        The mirror is the plane of symmetry normal to ``mirror_axis``.
+        """
         raise NotImplementedError(f"{self.name}: mirror_axis is None")
 
     def unreachable(self, position: Vector) -> UnreachableError:
@@ -300,7 +303,7 @@ class Machine(ABC):
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
         """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot go.
 
-        Positions that the working mode reaches in another assembly mode give 0 too.
+        The result is also 0 where the machine would have to be in another assembly mode.
         """
         found, _, conditioning, _ = self.evaluate(self.inverse(position))
         there = np.abs(np.subtract(found, position)).max(axis=-1) < SAME_PLACE

@@ -13,9 +13,9 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 CARBON_FIBRE = 1600.0  # kg/m^3
 SLIDES: Final = ("platform_x", "platform_y", "platform_z")
+"""Prismatic joints of :func:`free_platform`; their positions are the coordinates of P, m."""
 TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-"""Revolute joints of :func:`free_platform`; their positions are always 0 rad. The positions of its
-SLIDES are the coordinates of P, m."""
+"""Revolute joints of :func:`free_platform`; their positions are always 0 rad."""
 FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 

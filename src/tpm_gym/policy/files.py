@@ -2,9 +2,9 @@
 
 ``NAME.json`` describes the policy: its network, spaces, environment, recipe and versions.
 ``NAME.safetensors`` holds the weights. Both are plain data of a limited size; nothing in them is
-executed or unpickled. SHA-256 sums in the JSON reveal damage, and a pair of files that do not
-belong together.
-A forged file with new sums can make a policy act badly, but cannot run code.
+executed or unpickled. The JSON contains SHA-256 sums. They reveal a damaged file, and also
+two files that do not belong together. A forged file with new sums can make a policy act badly, but
+cannot run code.
 """
 
 from __future__ import annotations

@@ -29,9 +29,9 @@ def load_policy(path: str | Path) -> Policy:
     """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. Or the id of
-            an environment with a published policy, such as ``"TPMPickAndPlace-v0"``, if neither
-            file exists.
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; the JSON file and the file of weights
+            must both exist. If neither exists, ``path`` may be the id of an environment with a
+            published policy, such as ``"TPMPickAndPlace-v0"``.
 
     Raises:
         InputError: ``path`` is empty, or is neither a str nor a Path.
@@ -117,8 +117,8 @@ class Policy:
     def check(self, env: Any) -> None:
         """Check that the policy fits an environment.
 
-        Spaces are compared. So is the control of environments of tpm_gym, since Cartesian
-        increments and joint increments have equal spaces. The machine may differ.
+        The spaces are compared. For an environment of tpm_gym, the control is compared too, since
+        Cartesian increments and joint increments have equal spaces. The machine may differ.
 
         Args:
             env: Environment of Gymnasium, wrapped or not, or vector environment of Gymnasium or of
@@ -183,7 +183,7 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
 
 
 def _control(env: Any) -> str | None:
-    """Return the name of an environment's control; None if it is not of tpm_gym."""
+    """Return the name of an environment's control; None if the environment is not of tpm_gym."""
     own = getattr(env, "unwrapped", env)
     # Gymnasium's SyncVectorEnv has a list of environments, and no method that is safe to call here.
     first = next(iter(getattr(own, "envs", [])), own)

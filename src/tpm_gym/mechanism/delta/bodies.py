@@ -32,7 +32,7 @@ _MINUS_Y, _PLUS_Z, _ORIGIN = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
 class Inertia(NamedTuple):
-    """Constants of the dynamics; see :mod:`tpm_gym.mechanism.inertia`.
+    """Constants of the dynamics; see :mod:`tpm_gym.mechanism.inertia` for b, ``fixed``, ``spin``.
 
     Attributes:
         motors: For each leg, moment of inertia of the arm and of the rods' near ends about the
@@ -41,7 +41,8 @@ class Inertia(NamedTuple):
         couples: For each leg, sum of the constants b of its two rods B_iC_i, kg.
         platform: Mass at P, kg.
         fixed: For each leg, moment of inertia of its crosses about the axis of their swing, kg m^2.
-        spin: For each leg, moment of inertia of the rods about their own axes, over l4^2, kg.
+        spin: For each leg, moment of inertia of the rods about their own axes, divided by
+            l4^2, kg.
     """
 
     motors: Triple

@@ -210,7 +210,7 @@ def _turn(leg: _Leg, v: Triple, rate: float) -> Numbers:
 
 
 def _swinging(leg: _Leg) -> Numbers:
-    """Compute a leg's moment of inertia fixed + spin out^2 (:class:`.inertia.Swing`), kg m^2."""
+    """Compute ``fixed + spin * out**2`` of a leg's :class:`.inertia.Swing`, kg m^2."""
     out = leg.rod[1]
     return leg.swing.fixed + leg.swing.spin * out * out
 

@@ -13,8 +13,8 @@ whose centre is the elbow B_i displaced inwards by l2.
 * Constraint: the two rods of a leg lie in one plane, and keep the platform from turning about the
   normal of this plane. Where the three normals are coplanar, the platform can turn.
 
-As in :mod:`tpm_gym.kinematics.equations`, the functions compute with the numbers of a namespace,
-check nothing, and return whether a solution is real.
+As in :mod:`tpm_gym.kinematics.equations`, the functions take floats, arrays or tensors, check
+nothing, and return whether a solution exists.
 """
 
 import math

@@ -166,7 +166,10 @@ def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
 def no_assembly(
     theta: Vector, side: float, geometry: DeltaGeometry
 ) -> UnreachableError | SingularityError:
-    """Explain why the Delta, at theta (3,) rad, has no assembly, no J or another working mode."""
+    """Explain why the Delta has no solution at theta (3,) rad.
+
+    Either there is no assembly, or J does not exist, or the working mode is not the machine's.
+    """
     with np.errstate(all="ignore"):
         cos, sin = arms_at(tuple(map(np.float64, theta)), geometry, NUMPY)
         position, real, height2 = assembly_at(cos, sin, side, geometry, NUMPY)

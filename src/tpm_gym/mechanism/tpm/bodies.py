@@ -1,7 +1,7 @@
 """The mechanism from a Geometry: links, joints, inertias and loop closures.
 
-Some physics engines need a tree of links, so the loops are cut. The spanning tree, with the paper's
-numbers of links (Fig. 1), is:
+Some physics engines need a tree of links, so the loops are cut. The spanning tree, with the links
+numbered as in the paper (Fig. 1), is:
 
     base 0 - arm 2  - two rods 4                                        (branch I, the 4S rods)
     base 0 - arm 5  - rod 6 - link 3' - link 7 - platform 1 - end link 10   (branch II, platform)
@@ -226,11 +226,18 @@ def _by_joint(
     g: Geometry,
     turn: FloatArray | float = 0.0,
 ) -> dict[str, FloatArray]:
-    """Compute joint angles from the rods 4a, 4b, 6 and 11 (x, y, z) m, and link 7's beta, rad.
+    """Compute the angles of all joints, rad, from the vectors along the rods.
 
     A swing is the angle of a rod in the plane of its arm, and a tilt is the rod's elevation out of
-    this plane. A joint angle is a link's angle minus its parent's. ``turn`` (rad) is the rotation
-    of link 3' and the platform about y; joint angles are rotations about -y.
+    this plane. A joint angle is a link's angle minus its parent's.
+
+    Args:
+        theta: Angles of the motors, rad.
+        rods: Vectors (x, y, z) along rods 4a, 4b, 6 and 11, m.
+        beta: Angle of link 7 about z, rad.
+        g: Link lengths.
+        turn: Rotation of link 3' and the platform about y, rad. Joints R23 and R33 turn about
+            -y.
     """
     theta_1, theta_2, theta_3 = theta
     (x_4a, y_4a, z_4a), (x_4b, y_4b, z_4b), (x_6, _, z_6), (x_11, y_11, z_11) = rods

@@ -19,7 +19,7 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
   roll about its own axis, which does not change the motors' torques and is left out.
 
 Units are SI. In the paper frame, gravity points along +z, as the base hangs upside down. Functions
-with a Pose take the numbers of :mod:`tpm_gym.kinematics.equations`.
+with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def pose_at(
     """Assemble the mechanism at joint angles, for the signs of an assembly mode.
 
     Returns:
-        The configuration, and whether it is real.
+        The configuration, and whether it exists.
     """
     cos, sin = equations.arms(theta, g, ns)
     found, real, _ = equations.assembly_at(cos, sin, signs[0], signs[1], g, ns)

@@ -134,8 +134,8 @@ WIDE_TPM = TPM(
     name="wide",
     geometry=WIDE,
     mount=Mount(height=0.95),
-    # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin,
-    # and extended towards y = 0, where the penalty begins.
+    # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin.
+    # It is extended towards y = 0, to points whose conditioning is so low that the penalty acts.
     region=Region(low=(0.12, 0.10, 0.58), high=(0.48, 0.50, 0.883)),
     goal_region=Region(low=(0.14, 0.12, 0.62), high=(0.46, 0.48, 0.88)),
     home=(0.30, 0.36, 0.75),
