@@ -132,9 +132,10 @@ class ServoDrives:
     few hundred times per second. With the engine's rate and the stiffness of a real axis, a servo
     law that uses the joint positions at the beginning of a time step is unstable. So the law uses
     the predicted joint positions at the end of the time step (backward Euler). This law is stable
-    at any stiffness. The prediction uses the inertia M and the load: the last time step's torque
-    minus M times the last acceleration. The static stiffness equals ``stiffness`` under any load.
-    The damping is larger than ``damping`` by ``stiffness`` x ``time_step``.
+    at any stiffness. The prediction uses the inertia M and the load. The load is the torque in the
+    last time step minus M times the acceleration in the last time step. The static stiffness equals
+    ``stiffness`` under any load. The damping is larger than ``damping`` by ``stiffness`` x
+    ``time_step``.
 
     Args:
         servo: Parameters of the servo law.

@@ -279,7 +279,7 @@ def _rays(view: View, rows: slice, columns: slice) -> tuple[NDArray[Any], NDArra
 
 
 def tile(frames: Sequence[NDArray[Any]], columns: int | None = None) -> NDArray[Any]:
-    """Put k equal images (height, width, ...) into one image, row by row.
+    """Put k images of equal shape (height, width, ...) into one image, row by row.
 
     Args:
         frames: Images.

@@ -89,10 +89,11 @@ class CartesianControl:
 
 
 class JointControl:
-    """Control whose actions are increments of the three joints, in units of the joint limit.
+    """Control whose actions are increments of the three joints.
 
-    The increment is scaled down as a whole if it would move P farther than the step limit, or into
-    a posture that cannot be assembled. (This is frequent along y, where small turns of the joints
+    An action of 1 moves a joint by the machine's ``joint_limit``, scaled to the control period. The
+    increment is scaled down as a whole if it would move P farther than the step limit, or into a
+    posture that cannot be assembled. (This is frequent along y, where small turns of the joints
     move the platform far.) A command beyond the region is projected into it.
     """
 
@@ -178,7 +179,7 @@ class JointControl:
         return float(max(turns / self._turn, axes))
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide the joints by their limit."""
+        """Divide the joint positions by the joint limit."""
         places: FloatArray = self._machine.inverse(points) / self._turn
         return places
 
@@ -246,7 +247,11 @@ class Follower:
         return enough
 
     def _torques(self, before: FloatArray, current: FloatArray, then: FloatArray) -> FloatArray:
-        """Return the mid-path torques (k, n, 3) N m for k next commands ``then`` (k, n, 3) m."""
+        """Return the torques (k, n, 3) N m in the middle of the path of three commands.
+
+        ``before`` and ``current`` (n, 3) m are the first two commands. ``then`` (k, n, 3) m has k
+        alternatives for the third command.
+        """
         middle = (before + 6 * current + then) / 8
         ends = np.broadcast_to((before + current) / 2, then.shape), (current + then) / 2
         first, now, last = self._machine.inverse(np.stack([ends[0], middle, ends[1]]))

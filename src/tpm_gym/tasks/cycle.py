@@ -36,7 +36,7 @@ PAYLOAD: Final = 0.1
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
 """Largest RMS torque of the plan, as a share of the peak torque; 2% are a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Acceleration limits (x, y, z), as shares of the acceleration on one axis alone at peak torque."""
+"""Acceleration limits (x, y, z), as shares of P's largest acceleration along that axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
@@ -46,7 +46,7 @@ to brake along x and z at the same time.
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth of P, beyond the tolerance below the gate, at which the reward term is -1, m."""
+"""Depth of P below the gate, minus the tolerance, at which the reward term is -1, m."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""

@@ -19,7 +19,7 @@ from tpm_gym.tasks.task import Entry, Task, dense
 __all__ = ["Push"]
 
 CLEARANCE: Final = 0.008
-"""Height of the arriving lip over the block's top, and gap of the lowered lip to the face, m."""
+"""Height of the arriving lip over the block's top; then its distance from the pushed face, m."""
 SHORTEST: Final = 0.060
 LONGEST: Final = 0.240
 """Bounds (SHORTEST, LONGEST) of the block's displacement along the pushed face's normal, m."""
@@ -42,8 +42,8 @@ class Push(Task):
     """Shove a block over the table with the lip of the cup to the goal; the vacuum stays off.
 
     The block has to move by 60 to 240 mm, nearly along the normal of the pushed face. The robot can
-    reach the place behind the block. The workspace of the paper's machine is thin in y, so that the
-    block moves along x there.
+    reach the place behind the block. The workspace of the paper's machine is thin in y, so with
+    this machine the block moves along x.
     """
 
     block = Block(height=0.040)
@@ -110,7 +110,7 @@ class Push(Task):
         return point
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of the block, which turns when pushed."""
+        """Return the entries of the robot, then those of the block, which include its rotation."""
         return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:

@@ -85,8 +85,8 @@ class Task(ABC):
         events: Names of methods of the task that return (n,) bool for a state. ``info`` has the
             results. An evaluation reports the share of episodes in which each event occurred.
         control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
-            scaled to this time. With a shorter period, commands can ask for more torque than the
-            motors have, unless :attr:`accelerations` is set, and a shield requires this attribute.
+            scaled to this time. For a shorter time, set :attr:`accelerations`: without it, the
+            commands can need more torque than the motors have, and shields cannot be used.
         accelerations: Limits of the command's acceleration, and of its deceleration before the
             ends of the region, along x, y, z, machine's frame, m/s^2; None for no limits.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.

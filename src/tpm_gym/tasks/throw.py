@@ -1,4 +1,4 @@
-"""Throw: let a block go in flight, so that it slides to rest at a goal outside the workspace."""
+"""Throw: release a block in motion, so that it slides to rest at a goal outside the workspace."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _DRAWS: Final = 256
 
 
 class Throw(Task):
-    """Pick up a block and let it go in flight, so that it slides to the goal and stops there.
+    """Pick up a block and release it in motion, so that it slides to the goal and stops there.
 
     The goals lie on the table outside the workspace, 40 to 150 mm beyond either end of the
     machine's region along x, as far as the table and the speed of the machine allow. The block is

@@ -34,8 +34,8 @@ def timed(
     heat is the integral over time of the squared torques of all motors. Time and heat are convex in
     b, and so is their sum, which Newton's method minimises. Without g, the shape of the optimal b
     does not depend on the weights of time and heat in the sum. So the optimum is computed once,
-    without g. Its times are then multiplied by the factor at which, with g, a motor reaches a
-    limit.
+    without g. Its times are then multiplied by the smallest factor with which no motor exceeds a
+    limit, with g included.
 
     Args:
         machine: Machine. The torques include its payload.
@@ -143,7 +143,7 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Return by which factor all times must grow so that no motor exceeds a limit, by bisection."""
+    """Return the smallest factor of all times with which no motor exceeds a limit, by bisection."""
 
     def fits(factor: float) -> bool:
         found = torques / factor**2 + rest

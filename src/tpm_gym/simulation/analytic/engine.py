@@ -43,8 +43,8 @@ _NEAR_PLANE = 1.2
 ``step_limit`` (m) along this axis.
 
 Beyond this distance, torques are computed from differences of joint positions. At this distance
-and at full speed, these differences have an error of 0.2 m/s^2 in P's acceleration normal to the
-plane.
+and at full speed, P's acceleration normal to the plane, if computed from these differences, has an
+error of 0.2 m/s^2.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -196,10 +196,11 @@ class AnalyticEngine:
             self._repeat(rows, start, path, vacuum)
 
     def _near_plane(self, axis: int, path: Path) -> BoolArray:
-        """Return whether P or its path is near the plane of ``mirror_axis`` or crosses it, (n,).
+        """Return whether P or its path is near the plane of symmetry, or the path crosses it, (n,).
 
-        Near the plane, differences of the joint positions do not give the torques. The result is
-        True for all robots if any robot has had encoder bias or length errors.
+        The plane is normal to ``mirror_axis``. Near the plane, torques cannot be computed from
+        differences of the joint positions. The result is True for all robots if any robot has had
+        encoder bias or length errors.
         """
         if not self._exact:
             return np.ones(self._count, dtype=np.bool_)

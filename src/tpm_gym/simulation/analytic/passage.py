@@ -22,11 +22,12 @@ from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, Tou
 _LIFT: Final = 5e-5
 """Smallest distance from the plane, m, at which inertia and forces are computed.
 
-Closer to the plane, the values at this distance are used. They change with the square of the
-distance, so the error is smaller than the rounding errors at the true distance.
+Closer to the plane, the values at this distance are used. The values change with the square of the
+distance. So the error of this replacement is smaller than the rounding errors of values computed at
+the true distance.
 """
 _BESIDE: Final = 1e-4
-"""Distance, m, from P to two points before and behind it on the line of its velocity.
+"""Distance, m, from P to a point ahead of it and to a point behind it, on the line of its velocity.
 
 The joint positions at the three points give the second derivative of the joint positions at P.
 """

@@ -237,8 +237,9 @@ def modes_left(
 def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
     """Compute the joint velocities u after an impulse, with Coulomb friction.
 
-    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, its
-    size is at most limit. So u minimises u @ mass @ u / 2 - impulse @ u + limit @ |u|.
+    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, the
+    size of the resistance is at most limit. So u minimises
+    u @ mass @ u / 2 - impulse @ u + limit @ |u|.
 
     Args:
         mass: Inertia, kg m^2.

@@ -50,10 +50,10 @@ _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction o
 _BOX = (1.0, 1.0)  # Bullet's default scales
 _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
-"""Friction that was added to a contact in a time step: two entries, N.
+"""Record of the friction force that was added to a contact in a time step: two entries, N.
 
-The first entry is the second part of the force (``compiled.friction_force`` explains both parts).
-The second entry is the size of the largest force that could be added.
+The added force has two parts (see ``compiled.friction_force``). The first entry is the second part.
+The second entry is the largest size of the added force that the contact forces allow.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
@@ -62,7 +62,7 @@ _Slip = tuple[float, float, float, float]
 _Wrench = tuple[float, float, float, float, float, float]
 """Force (x, y, z) N, and torque (x, y, z) N m about an object's centre."""
 _Lacks = dict[tuple[int, int], _Wrench]
-"""Friction that the solver left out in a time step, of pairs of bodies that slide on each other."""
+"""For each pair of sliding bodies, the friction that the solver left out in a time step."""
 
 
 class _Face:
@@ -162,7 +162,8 @@ class Friction:
 
         Args:
             near: Indices of the objects that the cup can touch in the control period.
-            first: First time step in which the cup can touch an object; returned if none moves.
+            first: First time step in which the cup can touch an object. This is the result if no
+                object moves and the belt, if there is one, is at rest.
         """
         if self._belts and self._belts[0].speed:  # an object at rest on the belt slips
             self._active, self._resting = list(range(len(self._bodies))), set()

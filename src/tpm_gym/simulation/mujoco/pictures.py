@@ -123,7 +123,7 @@ def _close_all() -> None:
 
 
 def aim(own: mujoco.MjvCamera, camera: Camera) -> None:
-    """Set a camera of MuJoCo; the field of view is an attribute of the model."""
+    """Set the pose of a MuJoCo camera, not its field of view, which is stored in the model."""
     own.lookat[:], own.distance = camera.target, camera.distance
     own.azimuth, own.elevation = camera.yaw + 90.0, camera.pitch  # azimuth 0 is along +x
 

@@ -52,7 +52,10 @@ class TPMKind(Kind):
     machine: TPM
 
     def __init__(self, machine: TPM) -> None:
-        """Store the machine. Elbows count as out if they are as in the machine's mode."""
+        """Store the machine, and label its working modes.
+
+        The label of an elbow is "out" if it is bent as in the machine's working mode, else "in".
+        """
         super().__init__(machine)
         self.working = {
             (words, side): kinematics.WorkingMode(cos_beta, *signs)
