@@ -40,7 +40,7 @@ class TPMError(Exception):
 
 @dataclass(eq=False)
 class GeometryError(TPMError, ValueError):
-    """A link length (``"l4"``), or a combination of them, makes no usable mechanism."""
+    """A link length, such as ``"l4"``, or a combination of lengths makes no usable mechanism."""
 
     template: ClassVar[str] = "geometry: {name} = {value!r} m, but {requirement}"
     name: str

@@ -52,9 +52,9 @@ class Cells:
     def volume_error(self) -> float:
         """Bound of the error of the volume, m^3: half the volume of cells at the curved boundary.
 
-        Only the side of the boundary with more cells counts. The bound is proportional to the
-        spacing. The error is mostly far smaller, because cells that add too much volume and cells
-        that add too little cancel.
+        The cells just inside this boundary and the cells just outside it are counted, and the
+        larger number is used. The bound is proportional to the spacing. The error is mostly far
+        smaller, because cells that add too much volume and cells that add too little cancel.
         """
         halves = np.array_split(np.pad(self.mask, ((1, 1), (0, 0), (1, 1))), 2, axis=1)
         inside = sum((half & _grown(~half, corners=False)).sum() for half in halves)
@@ -172,9 +172,9 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     """Sample points (count, 3) m, uniform over an aspect, not only over its cells.
 
     Points are drawn in the aspect's cells and their neighbours, and kept if all factors have the
-    signs of the aspect. So parts of the aspect beyond the neighbouring cells are missing. Points of
-    another region in these cells are included if they have the same signs. Elsewhere the boundary
-    is exact.
+    signs of the aspect. So parts of the aspect beyond the neighbouring cells are missing, and
+    nearby points of other regions with the same signs are included. Apart from these two errors,
+    the points fill the aspect exactly up to its boundary.
 
     Raises:
         ConfigurationError: count is negative, or the aspect has no cells.

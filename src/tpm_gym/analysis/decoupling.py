@@ -8,8 +8,8 @@ in docs/paper.md. The derivatives of the closures by time are
     leg_2 w_2 = r_2x xC_dot + r_2z zC_dot
     leg_3 w_3 = r_3x xC_dot + r_3z zC_dot + k l7 beta_dot
 
-Only motors 1 and 2 move link 3'. Motor 3 turns link 7 and moves nothing else, so it moves P along
-(-sin(beta), cos(beta), 0).
+Only motors 1 and 2 move link 3'. If motor 3 turns alone, link 3' stays at rest and link 7 turns, so
+P moves along (-sin(beta), cos(beta), 0).
 """
 
 from dataclasses import dataclass

@@ -40,7 +40,7 @@ class Subspace:
 
     @classmethod
     def span(cls, vectors: ArrayLike) -> Subspace:
-        """Return the span of ``vectors`` (n, 3) of any lengths, zero included.
+        """Return the span of ``vectors`` (n, 3); their lengths do not matter, and may be zero.
 
         Raises:
             InputError: The shape is wrong, or an entry is not finite.
@@ -211,7 +211,8 @@ def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ..
             decomposition with the smallest sum of |Delta_j| is used.
 
     Raises:
-        InputError: The constraint degrees of this decomposition do not add up to zero.
+        InputError: There is no decomposition, or the constraint degrees of the decomposition that
+            is used do not add up to zero.
     """
     best = min(decompositions, key=lambda deltas: sum(abs(delta) for delta in deltas), default=())
     found, run = [], list[int]()

@@ -51,10 +51,11 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x, z, length of A2B1, and the coordinate (negative) of B2 from B1 along rod 6, m.
+    """Return x, z and length of the vector A2B1, and the coordinate of B2 along rod 6, m.
 
-    All values are for a view along y at theta_1 = ``t``, with leg 2 moved so that C2 is at C1. If
-    the planar factor is zero, rods 4 and 6 lie on one line, so that A2, B1 and B2 form a triangle.
+    The coordinate is measured from B1, and is never positive. All values are for a view along y at
+    theta_1 = ``t``, with leg 2 moved so that C2 is at C1. If the planar factor is zero, rods 4 and
+    6 lie on one line, and the coordinate's absolute value is the side B1B2 of the triangle A2B1B2.
     ``side`` is -1 if the rods point in opposite directions.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)

@@ -171,7 +171,7 @@ def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classifi
 def _edges(points: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArray, IntArray]:
     """Find the nearest of the planes y = 0 and y = l7 and the torus that leg 3 can reach.
 
-    Return the distance, its nearest point, and the index of its factor.
+    Return the distance, the nearest point on that surface, and the index of the surface's factor.
     """
     centre = np.array([geometry.l1 - geometry.l2, 0.0, geometry.l6])
     offset = points - centre

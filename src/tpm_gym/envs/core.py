@@ -476,7 +476,7 @@ def _goal_free(terms: Mapping[str, Any]) -> Any:
 def _not_finite(
     task: Task, state: State, achieved: NDArray[Any], terms: Mapping[str, Any]
 ) -> ConfigurationError:
-    """Return an error that names the first value of a task that is not finite."""
+    """Return an error that names the first non-finite value of a task."""
     values = {
         **{
             f"observed(), {entry.name!r}": entry.source(state)[:, slice(*entry.columns or (None,))]

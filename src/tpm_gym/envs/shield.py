@@ -86,8 +86,8 @@ class Shield:
 
     Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
     control, increments of the joints with joint control. They are measured from the wanted command,
-    which the control computes from the action. No safe command is nearer to the wanted command than
-    the returned command by more than 0.003 of these units.
+    which the control computes from the action. The returned command is at most 0.003 of these
+    units farther from the wanted command than the nearest safe command is.
 
     Args:
         machine: Nominal machine.
@@ -190,10 +190,10 @@ class Shield:
 class BrakingShield:
     """Shield of Cycle: replaces commands after which robots could not brake in time.
 
-    After a command, the robot can brake as hard as the ``follower`` allows. The command is safe if
-    the conditioning stays at ``least`` or above, and all torques within the motors' peak torques,
-    on the path to the command and while the robot brakes. So it is always safe to brake: the check
-    of the last command included the braking after it. An unsafe command is moved in a straight line
+    After a command, the robot can brake as hard as the ``follower`` allows. The command is safe if,
+    on the path to it and while the robot then brakes, the conditioning stays at ``least`` or above
+    and no torque exceeds the motor's peak torque. So it is always safe to brake: the check of the
+    last command included the braking after it. An unsafe command is moved in a straight line
     towards the command with which the robot brakes.
 
     Args:

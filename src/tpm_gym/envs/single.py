@@ -96,7 +96,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_offset | 3 | top of the object minus lip of the cup |
     | object_velocity | 3 | velocity of the object, from a camera |
     | object_tilt | 2 | x and y of the object's axis |
-    | object_held | 1 | share of the vacuum that holds the object, by a gauge |
+    | object_held | 1 | vacuum / largest vacuum, by a gauge, if the object is held; else 0 |
 
     The entries of the object are repeated for each object. Push adds the object's turn about the
     vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,
@@ -118,7 +118,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | goal, dense | minus the distance in units of 0.1 m; Cycle: steeper within 10 mm of the goal |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
-    | gate | minus the depth of P beyond 2 mm below Cycle's path (gate), in units of 5 mm |
+    | gate | -(d - 2 mm) / 5 mm, at most 0; d is the depth of P below Cycle's gate-shaped path |
 
     SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
     alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` keeps the other terms; so does SB3's buffer
@@ -174,10 +174,11 @@ class TPMEnv(gym.Env[Observation, Action]):
             a singularity; only for machines whose goals are near a singularity.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
-            100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
-            its attributes lags behind the references. Its defaults for stiffness and damping are
-            7500 N m/rad, 60 N m s/rad; the torques of the nominal motion are fed forward. Its
-            largest torque is 100 N m up to 18.75 rad/s, and falls to zero at 25 rad/s.
+            100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references. It
+            has the stiffness 7500 N m/rad and the damping 60 N m s/rad; the torques of the nominal
+            motion are fed forward. Its largest torque is 100 N m up to 18.75 rad/s, and falls to
+            zero at 25 rad/s. For a servo drive with other parameters, give a
+            :class:`~tpm_gym.simulation.Servo` or a mapping of its attributes.
         randomisation: Differences from the nominal machine, drawn for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Position and
             velocity keep their last values while disturbed encoders report joint positions that
@@ -317,7 +318,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
-            EpisodeError: If there is no episode: before reset, after close, after a lost loop.
+            EpisodeError: If there is no episode: before reset, after close or after a ClosureError.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
             ConfigurationError: If a result of the task is not finite.

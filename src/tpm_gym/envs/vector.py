@@ -500,7 +500,7 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return copies of the entries of ``last``, with the values of ``first`` in some rows."""
+    """Return a copy of a step's infos ``last``, with new episodes' infos ``first`` in ``rows``."""
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):

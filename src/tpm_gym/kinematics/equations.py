@@ -3,8 +3,9 @@
 The paper's frame O-xyz has its origin in the middle of the base. The base lies in the plane z = 0,
 and z points from the base towards the platform. Units are metres and radians. The mechanism has two
 loops of coupling degree zero, so forward and inverse kinematics reduce to intersections of circles.
-These are solved as vectors and as ``a cos + b sin = c``. The paper's half-angle forms (Eqs. 13 and
-15) are not used, because they fail where ``g_i = 0`` or ``theta_i = pi``.
+The intersections are computed with vectors, or from equations ``a cos + b sin = c``. The paper's
+half-angle forms (Eqs. 13 and 15) are not used, because they fail where ``g_i = 0`` or
+``theta_i = pi``.
 
 The functions compute with the numbers of their namespace ``ns``: arrays and tensors
 (:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code
@@ -31,9 +32,10 @@ ROUNDING = 64 * sys.float_info.epsilon
 Where two solutions merge, rounding can make it negative although the solutions exist."""
 _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
-"""Limit below which a factor of det A, divided by lengths, counts as zero. For sin(beta) and the
-paper's lengths, this is 50 nm in y. cos(beta) has an error of about 1e-14. So near cos(beta) = 1,
-sin(beta) has an error of about 1e-7, which is below the limit."""
+"""Limit below which a factor of det A, divided by lengths, counts as zero. With the paper's
+lengths, sin(beta) is below this limit where P is less than 50 nm from y = 0. cos(beta) has an error
+of about 1e-14. So near cos(beta) = 1, sin(beta) has an error of about 1e-7, which is below the
+limit."""
 LEAST = 1e-30
 """Smallest det A, m^3, for which the conditioning is computed. For a smaller det A, terms of the
 conditioning could overflow."""
@@ -79,7 +81,7 @@ class Factors(NamedTuple):
         leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad; zero where leg 1 is stretched or folded.
         leg2: B_2C_2 . dB_2/dtheta_2, m^2/rad.
         leg3: B_3C_3 . dB_3/dtheta_3, m^2/rad.
-        elevation: z_C1 - z_B1, m. At zero, a constraint singularity, the rods of the 4S
+        elevation: z_C1 - z_B1, m. Zero is a constraint singularity: there, the rods of the 4S
             parallelogram no longer keep link 3' from turning about y.
     """
 
@@ -119,10 +121,10 @@ def assembly_at(
     """Solve forward kinematics (Eqs. 6 to 11, corrected) for signs of planar factor and sin(beta).
 
     Eq. (6): in the plane y = 0, C1 is on two circles. With the elbow B1 at (0, y1, z1), the first
-    circle has the centre (0, z1) and radius^2 = l4^2 - y1^2. The second circle has the centre
-    (dx, z1 + dz), which is the elbow B2 displaced by 2 l5 along x, and the radius l4. The
-    intersection on the left of the line from the first to the second centre has a positive planar
-    factor, the other intersection a negative one.
+    circle has the centre (0, z1) and radius^2 = l4^2 - y1^2. The second circle has the radius l4.
+    Its centre (dx, z1 + dz) is the elbow B2 displaced by 2 l5 along x. The intersection on the left
+    of the line from the first to the second centre has a positive planar factor, the other
+    intersection a negative one.
 
     Returns:
         The assembly, whether it is real, and five values that explain why it is not. In this order,

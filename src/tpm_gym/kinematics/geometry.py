@@ -8,9 +8,9 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Fraction of l1 below which a length counts as 0. If l1 - l3 (the smallest y_B1) counts as 0, and
-so does l5 or |l5 - l1|, the circles of Eq. (6) can nearly coincide. Their intersections would be
-inaccurate."""
+"""Limit, as a fraction of l1, below which a length counts as 0. If l1 - l3 (the smallest y_B1) is
+below the limit, and l5 or |l5 - l1| is below it too, the circles of Eq. (6) can nearly coincide.
+Their intersections would be inaccurate."""
 
 
 class Lengths(NamedTuple):

@@ -178,7 +178,7 @@ def factors(
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
-    """Compute the factors at points, which are accurate at singularities too; NaN out of reach."""
+    """Compute factors at points; they are accurate at singularities too, and NaN out of reach."""
     return Factors(*_from_points(lambda c: c.factors, position, branch, geometry, math.nan))
 
 

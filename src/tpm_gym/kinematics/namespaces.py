@@ -90,7 +90,8 @@ NUMPY = Namespace(
 def _torch() -> Namespace:
     """Return the namespace for tensors.
 
-    Infinite derivatives are set to 0. Otherwise, the derivatives of other branches would be NaN.
+    Infinite derivatives are set to 0. Otherwise, an infinite derivative in one branch of the
+    kinematics would make the derivatives of the other branches NaN, as PyTorch multiplies it by 0.
     """
     import torch  # here, since torch is optional
 

@@ -306,13 +306,16 @@ def _refined(
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
-    """Sort solutions into slots: the half with the smaller ``sign`` first, then by the tilt."""
+    """Sort solutions into four slots; slots without a solution are NaN.
+
+    The half with the smaller ``sign`` gets the first two slots, the other half the last two. In
+    each half, the tilts in [0, 2 pi) are ascending.
+    """
     real = ~np.isnan(sign)
     count = real.sum(axis=-1, keepdims=True)
     half = count // 2
     positive = sign.argsort(axis=-1).argsort(axis=-1) >= half
     order = np.lexsort((np.mod(tilt, 2 * np.pi), positive, ~real), axis=-1)
-    # Half go to the first two slots, the others to the last two.
     place = np.concatenate([0 * half, 0 * half + 1, half, half + 1], axis=-1)
     filled = place < np.concatenate([half, half, count, count], axis=-1)
     source = np.take_along_axis(order, np.minimum(place, 3), axis=-1)

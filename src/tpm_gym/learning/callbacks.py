@@ -130,7 +130,7 @@ class ProgressBar(BaseCallback):
 
 
 class StopTrainingError(Exception):
-    """Exit from ``learn`` after the last checkpoint; users never see it."""
+    """Error that ends ``learn`` after the last checkpoint; it is caught, so users never see it."""
 
 
 @dataclass(eq=False)

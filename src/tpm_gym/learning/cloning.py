@@ -12,7 +12,7 @@ from torch.nn import functional
 _RATE: Final = 1e-3
 _BATCH: Final = 256
 _BETA: Final = 0.1
-"""Error of an action above which the loss is linear; below, it is quadratic.
+"""Limit of an action's error: above it the loss is linear, below it quadratic.
 
 In similar states, for example where the expert's path turns, the expert takes two different
 actions. A squared loss would teach the mean of the two actions, which is neither of them.

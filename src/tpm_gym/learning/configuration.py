@@ -76,7 +76,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment; an option that is not given keeps the id's value."""
+    """Options of an environment; "the id's" below means the default of the environment id."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""
@@ -174,7 +174,7 @@ class TrainingConfig:
     that saving takes at most 2% of the time."""
 
     threads: int = 1
-    """Threads of PyTorch. With one, small networks are fastest, and results repeat exactly."""
+    """PyTorch threads. With one thread, small networks are fastest, and results repeat exactly."""
 
     device: str = "cpu"
     """Device of PyTorch, such as cpu or cuda."""

@@ -341,7 +341,7 @@ def digest(data: Path, episodes: int | None = None) -> str:
 
     Args:
         data: Folder ``data`` of the dataset.
-        episodes: Number of episodes from the first on; None for all.
+        episodes: Number of episodes to include, starting with the first; None for all.
     """
     from minari.dataset.minari_storage import MinariStorage
 

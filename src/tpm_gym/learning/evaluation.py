@@ -65,7 +65,8 @@ class EvaluationConfig:
     """Episodes of each policy."""
 
     seed: int = TEST_SEED
-    """Seed of the first episode. Training and selection use seeds below the default."""
+    """Seed of the first episode. Training, and the choice of the best policy, use seeds below the
+    default seed."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
     """Goals: sampled everywhere, or only next to the singularity (tempting)."""
