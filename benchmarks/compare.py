@@ -364,7 +364,7 @@ ROWS = (
 )
 
 LEARNING = (
-    "PPO from nothing: trainings",
+    "PPO from scratch: trainings",
     "steps to 95%, median",
     "seconds of CPU to 95%, median",
     "success in PyBullet, median (range), %",

@@ -66,7 +66,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     yield _costs(record)
     yield ""
     if "renewed" in record:
-        yield f"Made again since: `{record['renewed']['command']}`."
+        yield f"These parts were measured again later: `{record['renewed']['command']}`."
         yield ""
     heads = list(dict.fromkeys((row["engine"], row["drive"]) for row in record["matrix"]))
     yield from table(
@@ -92,8 +92,8 @@ def _costs(record: dict[str, Any]) -> str:
     lost = ", ".join(f"{name} {100 * share:.1f}%" for name, share in record["energy_lost"].items())
     return (
         f"A control step of `TPMPickAndPlace-v0` under random actions: {times}; "
-        f"{'; '.join(ratios)} (median and quartiles of rounds that take turns). Energy that a fall "
-        f"of 0.16 s with the motors off loses: {lost}."
+        f"{'; '.join(ratios)} (median and quartiles of rounds in which the engines take turns). "
+        f"Energy lost in a fall of 0.16 s, with the motors off: {lost}."
     )
 
 

@@ -37,11 +37,13 @@ COLUMNS = (
 )  # fmt: skip
 LEGEND = (
     "Gap is the largest gap of the four closures. FK is the distance of the platform from the "
-    "forward kinematics of the encoders where 1/cond(J) > 0.05; near y = 0 is the largest such "
+    "forward kinematics of the encoders where 1/cond(J) > 0.05; "
+    'the column "near y = 0" has the largest such '
     "distance where 1/cond(J) is smaller. Track is the distance of the platform from its "
-    "reference. These columns are in mm, tilt is in degrees. All are over every time step of the "
-    "three motions. Cost is the CPU time of stepSimulation and the motor commands, with the robot "
-    "alone in the scene. The ratio compares the cost of a control period with that of the default "
+    "reference. These columns are in mm, tilt is in degrees. Mean, 99.9% "
+    "and max are those of all time steps of the three motions. Cost is the CPU time of "
+    "stepSimulation and the motor commands, with the robot alone in the scene. "
+    "The ratio compares the cost of a control period with that of the default "
     "in the same round of timing."
 )
 

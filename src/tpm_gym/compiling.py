@@ -65,10 +65,10 @@ class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has
         return self.stamp, super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Return the machine code; None if other sources were compiled.
+        """Return the machine code; None if its sources have changed since it was compiled.
 
-        Numba writes a new index first, then the code. Until the code is written, or if the process
-        is killed before, the new index points to the code of older sources.
+        Numba writes a new index first, then the new code. In between, the new index points to the
+        old code. This remains so if the process is killed in between.
         """
         stamp, code = payload
         return super().rebuild(target_context, code) if stamp == self.stamp else None
@@ -152,7 +152,7 @@ class _Cache:
 
 _CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
 _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
-"""Packages whose functions enter a stamp by name only; their sources are not read."""
+"""Packages whose functions :func:`stamp` includes by name only; it does not read their sources."""
 
 
 def stamp(function: Callable[..., Any]) -> str:

@@ -12,7 +12,7 @@ _LONGEST = 200  # characters of a value in a message
 
 
 def brief(value: Any) -> Any:
-    """Return a value for a message, or the beginning of a long one."""
+    """Return a value for a message; a long value is cut after its beginning."""
     try:
         text = repr(value)
     except Exception as error:  # integers beyond 4300 digits, and any other repr() that fails
@@ -40,7 +40,7 @@ class TPMError(Exception):
 
 @dataclass(eq=False)
 class GeometryError(TPMError, ValueError):
-    """A link length (``"l4"``), or a combination of them, makes no usable mechanism."""
+    """A link length, such as ``"l4"``, or a combination of lengths makes no usable mechanism."""
 
     template: ClassVar[str] = "geometry: {name} = {value!r} m, but {requirement}"
     name: str

@@ -50,10 +50,11 @@ class Cells:
 
     @property
     def volume_error(self) -> float:
-        """Bound of the error of the volume, m^3: half of all cells along the curved boundary.
+        """Bound of the error of the volume, m^3: half the volume of cells at the curved boundary.
 
-        It is proportional to the spacing. The error itself is mostly far smaller, because cells
-        that count too much and too little cancel.
+        The cells just inside this boundary and the cells just outside it are counted, and the
+        larger number is used. The bound is proportional to the spacing. The error is mostly far
+        smaller, because cells that add too much volume and cells that add too little cancel.
         """
         halves = np.array_split(np.pad(self.mask, ((1, 1), (0, 0), (1, 1))), 2, axis=1)
         inside = sum((half & _grown(~half, corners=False)).sum() for half in halves)
@@ -73,7 +74,7 @@ class Aspect:
     Attributes:
         branch: Working mode: the signs of the serial factors.
         assembly: Assembly mode: the signs of sin(beta) and the planar factor.
-        level3: Sign of the parallel factor l1 + l3 c3 - xC - 2 l2.
+        level3: Sign of the parallel factor l1 + l3 cos(theta_3) - xC - 2 l2.
         elevation: Sign of z_C1 - z_B1, which is zero at a constraint singularity.
     """
 
@@ -88,7 +89,7 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Box:
-    """Box of :func:`largest_box`: volume in m^3, and least 1/cond(J) at centres of its cells."""
+    """Result of :func:`largest_box`, with volume in m^3 and smallest 1/cond(J) at its nodes."""
 
     region: Region
     volume: float
@@ -171,8 +172,9 @@ def sample(rng: np.random.Generator, aspect: Aspect, count: int) -> FloatArray:
     """Sample points (count, 3) m, uniform over an aspect, not only over its cells.
 
     Points are drawn in the aspect's cells and their neighbours, and kept if all factors have the
-    signs of the aspect. So a part of the aspect farther away is missing, and a part of another
-    region is included if it is so near and has the same signs. Elsewhere the boundary is exact.
+    signs of the aspect. So parts of the aspect beyond the neighbouring cells are missing, and
+    nearby points of other regions with the same signs are included. Apart from these two errors,
+    the points fill the aspect exactly up to its boundary.
 
     Raises:
         ConfigurationError: count is negative, or the aspect has no cells.
@@ -251,7 +253,11 @@ def _codes(
 def _signs(
     points: FloatArray, branch: WorkingMode, geometry: Geometry, limits: tuple[Limit, ...]
 ) -> IntArray:
-    """Return the signs of sin(beta), level3, planar, elevation as bits; -1 where P cannot be."""
+    """Return the signs of four singular factors as bits; -1 out of reach or beyond a limit.
+
+    The bits 1, 2, 4 and 8 are set where ``sin_beta``, ``level3``, ``planar`` and ``elevation`` of
+    :class:`~tpm_gym.kinematics.Factors` are positive.
+    """
     found = factors_at(points, branch, geometry)
     values = np.stack([found.sin_beta, found.level3, found.planar, found.elevation], axis=-1)
     codes: IntArray = np.where(np.isnan(values[..., 0]), -1, (values > 0) @ _BITS)
@@ -296,7 +302,10 @@ def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
 
 
 def largest_block(mask: BoolArray) -> tuple[Shape, Shape] | None:
-    """Return the first and last node of the largest all-true block with a volume, or None."""
+    """Return the first and last node of the largest block in which all nodes are true.
+
+    A block has at least two nodes along each axis. Return None if there is no block.
+    """
     # For each range of y and each width in x, find the longest run along z that is true over both.
     nx, ny, nz = mask.shape
     count = np.cumsum(np.pad(mask, ((0, 0), (1, 0), (0, 0))), axis=1)

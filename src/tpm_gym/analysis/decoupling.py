@@ -1,15 +1,15 @@
 """Partial decoupling of the mechanism: which motor moves which coordinate.
 
 Let r_i be the vector B_iC_i, w_i the speed of motor i, leg_i the factor of leg i in Eq. (17), and
-k = sin(beta) level3 the product of two factors in Eq. (16). Both equations are used as corrected in
-docs/paper.md. The derivatives of the closures by time are
+k = sin(beta) level3, the product of two factors in Eq. (16). Both equations are used as corrected
+in docs/paper.md. The derivatives of the closures by time are
 
-    leg_1 w_1 = r_1x xC' + r_1z zC'
-    leg_2 w_2 = r_2x xC' + r_2z zC'
-    leg_3 w_3 = r_3x xC' + r_3z zC' + k l7 beta'
+    leg_1 w_1 = r_1x xC_dot + r_1z zC_dot
+    leg_2 w_2 = r_2x xC_dot + r_2z zC_dot
+    leg_3 w_3 = r_3x xC_dot + r_3z zC_dot + k l7 beta_dot
 
-Only motors 1 and 2 move link 3'. Motor 3 turns link 7 and moves nothing else, so it moves P along
-(-sin(beta), cos(beta), 0).
+Only motors 1 and 2 move link 3'. If motor 3 turns alone, link 3' stays at rest and link 7 turns, so
+P moves along (-sin(beta), cos(beta), 0).
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ The inverse matrix has its zeros at the same places. xC and zC belong to link 3'
 
 @dataclass(frozen=True, eq=False)
 class Index:
-    """Means of :func:`shares` (3, 3) and :func:`motors` (3,) over a region, from :func:`over`."""
+    """Averages of :func:`shares` (3, 3) and :func:`motors` (3,) in a region, from :func:`over`."""
 
     shares: FloatArray
     motors: FloatArray
@@ -48,9 +48,9 @@ def shares(velocity: ArrayLike) -> FloatArray:
     """Compute the share of each motor in the motion of each coordinate, (..., 3, 3), in [0, 1].
 
     The share is J_ij^2 / sum_j J_ij^2 of the velocity Jacobian (..., 3, 3) of any mechanism whose
-    motors have the same unit. If the speeds of the motors are independent and equally large, it is
-    the part of the variance of coordinate i that motor j causes. Rows add up to 1. The row of a
-    coordinate that cannot move is NaN.
+    motors have the same unit. If the speeds of the motors are independent and have equal variances,
+    motor j causes this share of the variance of the speed of coordinate i. Rows add up to 1. The
+    row of a coordinate that cannot move is NaN.
     """
     squares = finite_points("velocity", velocity) ** 2
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Topology, workspace and aspects of the Delta, by the counts and grids of the TPM's analysis."""
+"""Topology, workspace and aspects of the Delta, computed by the same methods as for the TPM."""
 
 from dataclasses import dataclass
 
@@ -67,7 +67,7 @@ class Aspect:
 
     Attributes:
         assembly: Assembly mode, the sign of det A.
-        constraint: Sign of det [n1 n2 n3], the normals of the parallelograms.
+        constraint: Sign of det [n1 n2 n3], where n_i is the normal of the parallelogram of leg i.
         cells: Cells of the region.
     """
 
@@ -119,7 +119,10 @@ def aspects(
 def _codes(
     bends: Triple, geometry: DeltaGeometry, shape: Shape, within_stops: bool
 ) -> tuple[Triple, Triple, IntArray]:
-    """Return corner and spacing of the grid, and the signs at its cells; -1 where P cannot be."""
+    """Return corner and spacing of the grid, and the signs at the centres of its cells as bits.
+
+    The entry of a cell is -1 if its centre is out of reach or beyond a stop.
+    """
     require_delta(geometry)
     require_shape(shape, 2)
     far, aside = geometry.l3 + geometry.l4, abs(geometry.l1 - geometry.l2)

@@ -1,10 +1,11 @@
 """POC sets (position and orientation characteristics) and the counts of Eqs. (1) to (5).
 
 A POC set is a pair of subspaces of R^3 for the motion of a link relative to the base: the span of
-its directions of translation, and the span of its axes of rotation. Union is the span of both,
-intersection the common subspace, separately for translations and rotations, as in the columns
-[t; r] of the paper. A revolute joint with axis s through a point p contributes r(|| s). It also
-contributes t along s x (o' - p), unless the axis passes through the base point o' of the end link.
+its directions of translation, and the span of its axes of rotation. The union of two sets is the
+span of their subspaces, and the intersection is the subspace common to them. Translations and
+rotations are treated separately, as in the columns [t; r] of the paper. A revolute joint with axis
+s through a point p contributes r(|| s). It also contributes t along s x (o' - p), unless the axis
+passes through the base point o' of the end link.
 
 Subspaces replace the paper's symbols for directions. Choose the base point so that no element of a
 set depends on the others: the paper writes dependent elements in braces, and this module cannot
@@ -26,8 +27,8 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray, finite, finite_points, numbers
 from tpm_gym.errors import InputError
 
-# Directions closer than this (sine of the angle) are equal, and shorter vectors are zero. It is far
-# above rounding, and far below any value away from a singularity.
+# Directions closer than this (sine of the angle) are equal, and shorter vectors are zero. The value
+# is far above rounding errors, and far below all values away from a singularity.
 _SAME = 1e-9
 
 
@@ -39,7 +40,7 @@ class Subspace:
 
     @classmethod
     def span(cls, vectors: ArrayLike) -> Subspace:
-        """Return the span of ``vectors`` (n, 3) of any lengths, zero included.
+        """Return the span of ``vectors`` (n, 3); their lengths do not matter, and may be zero.
 
         Raises:
             InputError: The shape is wrong, or an entry is not finite.
@@ -70,11 +71,11 @@ class Subspace:
         return Subspace(np.linalg.svd(self.basis)[2][self.dim :])
 
     def __or__(self, other: Subspace) -> Subspace:
-        """Return the union in the sense of POC theory: the span of both."""
+        """Return the union in the sense of POC theory: the span of both subspaces."""
         return Subspace.span(np.concatenate([self.basis, other.basis]))
 
     def __and__(self, other: Subspace) -> Subspace:
-        """Return the intersection, by the rule of complements."""
+        """Return the intersection: the complement of the union of the complements."""
         return (self.complement | other.complement).complement
 
 
@@ -145,9 +146,9 @@ def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = F
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four spherical pairs, the paper's P^(4S) P^(4S) R^(4S) R^(4S).
 
-    ``short`` (3,) is the direction of the short links, ``rod`` (3,) that of the rods. The far short
-    link, with its middle at ``point`` (3,) m, cannot translate along ``rod``, nor rotate about the
-    normal of ``short`` and ``rod``.
+    The short links are parallel to ``short`` (3,), the rods to ``rod`` (3,). The far short link,
+    with its middle at ``point`` (3,) m, cannot translate along ``rod``, nor rotate about the normal
+    of ``short`` and ``rod``.
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])
@@ -157,8 +158,9 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
 def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four revolutes, P^(4R); arguments as in :func:`parallelogram_4s`.
 
-    It translates in its plane, across the rods. The paper writes t^1(|| R32), the direction of the
-    short links; this is exact only if the rods are perpendicular to them.
+    The far short link translates in the plane of the parallelogram, perpendicular to the rods. The
+    paper writes t^1(|| R32), a translation along the short links. This is exact only if the rods
+    are perpendicular to the short links.
     """
     return Unit(name, point, np.cross(rod, np.cross(short, rod))[None], np.empty((0, 3)))
 
@@ -205,11 +207,12 @@ def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ..
     An AKC ends where its constraint degrees add up to zero.
 
     Args:
-        decompositions: Constraint degrees Delta_j of the loops, for each decomposition. The one
-            with the smallest sum of |Delta_j| is used.
+        decompositions: Constraint degrees Delta_j of the loops, for each decomposition. The
+            decomposition with the smallest sum of |Delta_j| is used.
 
     Raises:
-        InputError: The constraint degrees of this decomposition do not add up to zero.
+        InputError: There is no decomposition, or the constraint degrees of the decomposition that
+            is used do not add up to zero.
     """
     best = min(decompositions, key=lambda deltas: sum(abs(delta) for delta in deltas), default=())
     found, run = [], list[int]()
@@ -225,9 +228,10 @@ def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ..
 
 @dataclass(frozen=True)
 class Loop:
-    """Independent loop, closed by one single open chain (SOC) of the named chains.
+    """Independent loop, closed by one single open chain (SOC).
 
     Attributes:
+        chains: Names of the chains that form the SOC.
         freedoms: Sum of f_i over the SOC.
         actuated: Number of motors, I_j.
         equations: Number of independent equations, xi_Lj.
@@ -240,7 +244,7 @@ class Loop:
 
     @property
     def constraint(self) -> int:
-        """Constraint degree, Delta_j = sum of f_i - I_j - xi_Lj, the second Eq. (4)."""
+        """Constraint degree, Delta_j = sum of f_i - I_j - xi_Lj; the paper's second Eq. (4)."""
         return self.freedoms - self.actuated - self.equations
 
 
@@ -294,13 +298,13 @@ def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
 def decompositions(chains: Sequence[Chain], point: ArrayLike) -> tuple[tuple[Loop, ...], ...]:
     """Return the independent loops, for each order in which the chains can be joined.
 
-    Motions are those of ``point``, (3,) m.
+    POC sets are about ``point`` (3,) m, the base point of the platform.
     """
     return tuple(_loops(order) for order in permutations([(c, c.poc(point)) for c in chains]))
 
 
 def _loops(order: tuple[tuple[Chain, POCSet], ...]) -> tuple[Loop, ...]:
-    """Return the loops that form as chains are added in order; the first one has two chains."""
+    """Return the loops formed by adding the chains in order; the first loop has two chains."""
     chains, sets = zip(*order, strict=True)
     loops = []
     for j in range(1, len(order)):

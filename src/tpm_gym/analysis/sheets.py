@@ -1,10 +1,10 @@
 """Singular surfaces, each swept by link 7 along a curve of C1, and the nearest points on them.
 
 The singularity factors level3, planar, leg 1, leg 2 and elevation depend on xC and zC alone. So
-each is zero on a curve of C1 in the plane y = 0, and P is on a circle of radius l7 about (xC + l2,
-0, zC + 2 l6), parallel to xy. Each curve has a closed form over one angle, so the distance to a
-surface is a minimum over one angle. A curve consists of arcs, intervals of the angle in which it is
-real.
+each factor is zero if C1 is on a curve in the plane y = 0. For each point of the curve, P is on a
+circle of radius l7 about (xC + l2, 0, zC + 2 l6), parallel to xy. Each curve is a closed-form
+function of one angle, so the distance to a surface is a minimum over one angle. A curve consists of
+arcs, one for each interval of the angle in which the curve is real.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from tpm_gym.kinematics.modes import WorkingMode
 
 Point = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 """xC and zC in m, and two numbers p and q. The point belongs to the working mode if
-p + q cos(beta) > 0, and cos(beta) has the sign of the mode."""
+p + q cos(beta) > 0 and cos(beta) has the sign of the mode."""
 Curve = Callable[[Geometry, WorkingMode, FloatArray, FloatArray, FloatArray], Point]
-"""Point of a curve, as a function of lengths, mode, angle, and two signs that name the branch."""
+"""Point of a curve, as a function of lengths, mode, angle, and two signs that select a branch."""
 
 _CELLS = 256  # cells of an arc
 _FINE = 4 * _CELLS  # chords that measure the length of an arc
@@ -51,10 +51,11 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x, z and length of A2B1, and the coordinate of B2 from B1 along rod 6, below 0, m.
+    """Return x, z and length of the vector A2B1, and the coordinate of B2 along rod 6, m.
 
-    Everything is seen along y at theta_1 = ``t``, with leg 2 moved so that C2 is at C1. Where the
-    planar factor is zero, rods 4 and 6 lie on one line, so that A2, B1 and B2 form a triangle.
+    The coordinate is measured from B1, and is never positive. All values are for a view along y at
+    theta_1 = ``t``, with leg 2 moved so that C2 is at C1. If the planar factor is zero, rods 4 and
+    6 lie on one line, and the coordinate's absolute value is the side B1B2 of the triangle A2B1B2.
     ``side`` is -1 if the rods point in opposite directions.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
@@ -123,7 +124,15 @@ _CURVES: dict[str, Curve] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """Arcs of one factor, n in number: signs (n,), and intervals of the angle (n,), rad."""
+    """The n arcs of one factor.
+
+    Attributes:
+        curve: Function that gives the points.
+        first: (n,) first sign.
+        second: (n,) second sign.
+        middle: (n,) rad, middle of the interval of the angle.
+        half: (n,) rad, half the length of the interval.
+    """
 
     curve: Curve
     geometry: Geometry
@@ -134,7 +143,7 @@ class _Arcs:
     half: FloatArray
 
     def at(self, arc: IntArray, t: FloatArray) -> Point:
-        """Return points at t (k, ...) of arcs (k,)."""
+        """Return points at ``t`` (k, ...), from 0 to pi, of arcs (k,)."""
         arc = arc.reshape(-1, *[1] * (t.ndim - 1))
         # t runs from 0 to pi, so that the curve is smooth at both ends.
         angle = self.middle[arc] - self.half[arc] * np.cos(t)
@@ -144,7 +153,7 @@ class _Arcs:
 
 @lru_cache(maxsize=64)
 def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Point, FloatArray]:
-    """Return n arcs, points (n, cells + 1), and curve lengths between these, (n, cells) m."""
+    """Return n arcs, points (n, cells + 1), and the lengths (n, cells) m of the arcs' cells."""
     rows = [
         (first, second, (low + high) / 2, (high - low) / 2)
         for first in (-1, 1)
@@ -178,7 +187,10 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
 
 
 def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, float]]:
-    """Return the intervals of a turn in which a function is positive, short ones included."""
+    """Return the intervals of the angle, from 0 to 2 pi, in which a function is positive.
+
+    Intervals shorter than a cell of the search are found too.
+    """
     t = np.linspace(0.0, 2 * np.pi, _GRID + 1)
     values = real(t)
     towards = np.abs(values)
@@ -200,9 +212,9 @@ def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, fl
 def _zoom(
     function: Callable[[FloatArray], FloatArray], low: FloatArray, high: FloatArray
 ) -> FloatArray:
-    """Return where n functions are smallest, (n,), between ``low`` and ``high`` (n,).
+    """Return the arguments (n,) at which n functions are smallest, between ``low`` and ``high``.
 
-    ``function`` takes numbers (n, nodes), a row for each function, and returns the values.
+    ``function`` converts arguments (n, nodes), a row for each function, to values (n, nodes).
     """
     steps, rows = np.linspace(0, 1, _NODES), np.arange(len(low))
     found = low
@@ -228,8 +240,8 @@ def nearest(
         geometry: Link lengths.
 
     Returns:
-        Distance (n,) m, nearest point (n, 3) m and index of the factor (n,). Where no surface is
-        nearer than ``limit``, these are ``limit``, the point itself and -1.
+        Distance (n,) m, nearest point (n, 3) m and index of the factor (n,). If no surface is
+        nearer than ``limit``, they are ``limit``, the point itself and -1.
     """
     distance, feet, factor = limit.copy(), points.copy(), np.full(len(points), -1)
     for start in range(0, len(points), _BLOCK):
@@ -247,15 +259,21 @@ def nearest(
 def _feet(
     points: FloatArray, limit: FloatArray, mode: WorkingMode, g: Geometry, name: str
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return candidates for the nearest points of a surface: rows of points, distances, feet."""
+    """Return candidates for the nearest points of a surface.
+
+    Returns:
+        For each of c candidates: row of ``points`` (c,), distance (c,) m, point of the surface
+        (c, 3) m.
+    """
     arcs, (x, z, p, q), length = _arcs(g, mode, name)
     link3 = points - [g.l2, 0, 2 * g.l6]  # C1 for a link 7 of length 0
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the distances of ``rows`` to circles about (x, 0, z), and to these centres.
+        """Return the distances of points ``rows`` (..., 3) m to circles, and to their centres.
 
-        The circles have the radius l7 and are parallel to xy. Distances to the centres are measured
-        along x, and in the plane xy.
+        The circles have the centres (x, 0, z) and the radius l7, and are parallel to xy. There are
+        two distances to a centre: the signed distance along x, and the distance in a projection on
+        xy.
         """
         level = rows[..., 0] - x
         radius = np.hypot(level, rows[..., 1])
@@ -276,7 +294,7 @@ def _feet(
     low, all_ = cell.astype(np.float64) * step, np.arange(len(cell))
 
     def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
-        """Return points at t (k, ...) of cells (k,), and what offset() and belongs() return."""
+        """Return points at t (k, ...) of cells (k,), and the results of offset() and belongs()."""
         point, rows = arcs.at(arc[cells], t), link3[row[cells]]
         found = offset(rows[:, None] if t.ndim > 1 else rows, *point[:2])
         return point, found, belongs(point, *found[1:])

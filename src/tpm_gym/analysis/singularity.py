@@ -2,8 +2,9 @@
 
 A configuration is singular where one of eight factors is zero. Three parallel factors make up
 det A and four serial factors make up det B (Eqs. 16 and 17, corrected). The eighth factor is the
-elevation z_C1 - z_B1 of rods 4: where it is zero, nothing keeps link 3' from turning about y, a
-constraint singularity that the paper lacks. Everything is in the paper frame, in m and rad.
+elevation z_C1 - z_B1 of rods 4. If the elevation is zero, nothing keeps link 3' from turning about
+y. The paper does not have this constraint singularity. All values are in the paper frame, in m and
+rad.
 
 Functions of angles or points take arrays (..., 3) of numbers and raise InputError for anything
 else. The functions that classify also raise InputError for numbers that are not finite,
@@ -84,7 +85,7 @@ class NearestSingularity:
 
 
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
-    """Divide the factors by lengths, (..., 8), so that one tolerance suits all.
+    """Divide the factors (..., 8) by lengths, so that one tolerance suits all factors.
 
     level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
     """
@@ -115,8 +116,8 @@ def classify_at(
 ) -> Classification:
     """Classify points (..., 3) m on one working mode.
 
-    The factor of a leg grows as the square root of the distance to its boundary: 1e-12 m from the
-    boundary it is 1e-6.
+    At the boundary of a leg's reach, the factor of the leg is zero. It grows as the square root of
+    the distance to this boundary: at a distance of 1e-12 m, the factor is about 1e-6.
     """
     points = numbers("position", position)
     inverse(points, branch, geometry)  # raises UnreachableError with the reason
@@ -131,9 +132,9 @@ def nearest_singularity(
 ) -> NearestSingularity:
     """Find the nearest singular position of points (..., 3) m, in Cartesian space.
 
-    The distance is the radius of the largest ball about the point such that P can move in the ball
-    without a singularity of any kind. Distances to the planes y = 0 and |y| = l7 and to the
-    boundary of leg 3 are exact, the others numerical. Points are not valid if they are not finite,
+    The distance is the radius of the largest ball about the point in which P can move without a
+    singularity of any kind. Distances to the planes y = 0 and |y| = l7 and to the boundary of leg
+    3's reach are exact; other distances are numerical. Points are not valid if they are not finite,
     or not reachable in the working mode ``branch`` and the assembly mode ``assembly``.
     """
     require_mode(assembly, AssemblyMode)
@@ -168,7 +169,10 @@ def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classifi
 
 
 def _edges(points: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Compare y = 0, y = l7 and the torus of leg 3; return the nearest: distance, foot, factor."""
+    """Find the nearest of the planes y = 0 and y = l7 and the torus that leg 3 can reach.
+
+    Return the distance, the nearest point on that surface, and the index of the surface's factor.
+    """
     centre = np.array([geometry.l1 - geometry.l2, 0.0, geometry.l6])
     offset = points - centre
     radius = np.hypot(offset[:, 0], offset[:, 2])

@@ -6,10 +6,10 @@ Two independent counts of the degrees of freedom start from the axes of the join
 * :func:`mobility` computes the rank of the closure Jacobian of the mechanism that engines load,
   with all rods and balls of the parallelograms.
 
-Both agree at singularities too. If z_C1 = z_B1, both find 4 instantaneous freedoms, because link 3'
-can begin to turn about y. Vectors are in the paper frame. Functions of joint angles take three
-finite numbers and raise InputError for anything else. They raise UnreachableError if the assembly
-mode does not exist at these angles.
+The counts agree at singularities too. If z_C1 = z_B1, both counts are 4 instantaneous freedoms,
+because link 3' can begin to turn about y. Vectors are in the paper frame. Functions of joint angles
+take three finite numbers and raise InputError for anything else. They raise UnreachableError if the
+assembly mode does not exist at these angles.
 """
 
 from collections.abc import Mapping
@@ -96,7 +96,7 @@ class Topology(poc.ParallelMechanism):
     """Result of :func:`analyse`. The paper's decomposition (I and II, then III) comes first.
 
     Attributes:
-        sub_mechanism: M_Pa(1-2) of the first Eq. (4): POC set of link 3' on branches I and II.
+        sub_mechanism: M_Pa(1-2) of the paper's first Eq. (4): POC set of link 3' on branches I, II.
         hsoc_1: POC set of the platform on branches I and II with R12, R13.
         hsoc_2: POC set of the platform on branch III.
     """

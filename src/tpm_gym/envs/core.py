@@ -442,13 +442,13 @@ def _as_in_json(physics: Any) -> Any:
 
 
 def _view(state: State) -> FloatArray:
-    """Return what a camera shows of the objects, (n, k, 9): position, axis, velocity."""
+    """Return the camera's view of the objects, (n, k, 9): position, axis, velocity."""
     parts = state.object_position, state.object_axis, state.object_velocity
     return np.concatenate(parts, axis=2)
 
 
 def _seen(state: State, view: FloatArray) -> State:
-    """Return a state with objects as in a view (n, k, 9)."""
+    """Return a copy of a state with the objects of a camera's view (n, k, 9)."""
     position, axis, velocity = np.split(view, 3, axis=2)
     return replace(state, object_position=position, object_axis=axis, object_velocity=velocity)
 
@@ -477,7 +477,7 @@ def _goal_free(terms: Mapping[str, Any]) -> Any:
 def _not_finite(
     task: Task, state: State, achieved: NDArray[Any], terms: Mapping[str, Any]
 ) -> ConfigurationError:
-    """Return an error that names the first value of a task that is not finite."""
+    """Return an error that names the first non-finite value of a task."""
     values = {
         **{
             f"observed(), {entry.name!r}": entry.source(state)[:, slice(*entry.columns or (None,))]

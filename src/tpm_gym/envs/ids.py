@@ -27,8 +27,8 @@ def register_task(
 ) -> tuple[str, ...]:
     """Register a task's ids ``TPM<name>{,Joints}{,Dense}-v<version>``.
 
-    Ids with ``Joints`` are registered if ``task.controls`` has joint control. An equal second call
-    changes nothing.
+    Ids with ``Joints`` are registered if ``task.controls`` has joint control. A second call
+    with equal arguments changes nothing.
 
     ``TPMEnv(task=...)`` accepts ``name`` in snake case. The command line, and worker processes that
     are spawned rather than forked, need ``"module:id"``: importing the module registers the id.

@@ -65,7 +65,7 @@ class Pixels:
     """
 
     def __init__(self, task: Task, camera: Any, size: int) -> None:
-        """Find the entries of the observation vector that remain."""
+        """Find the entries of the observation vector that the pictures do not replace."""
         if not is_whole(size, 16) or size > 1024:
             raise ConfigurationError("pixel_size", size, "a whole number of pixels from 16 to 1024")
         self._rendering = Rendering(task.machine, "rgb_array", camera, size, size)
@@ -93,7 +93,7 @@ class Pixels:
 
         Args:
             observation: Observations without pictures, rows first.
-            simulation: What is drawn.
+            simulation: Simulation to draw.
             rows: Row and goal markers of each environment.
         """
         frames = [self._rendering.frame(simulation, row, markers) for row, markers in rows]

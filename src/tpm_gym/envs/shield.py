@@ -4,16 +4,16 @@ Let c be the last command, d the next one, and m the middle of the last two comm
 period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If the
 command then stays at d, P moves on to d in a straight line. The command d is safe if the
 conditioning 1/cond(J) stays at ``least`` or above on curve and line. So it is always safe to hold
-the last command.
+the last command c: P then moves on the line from m to c, and the check of c included this line.
 
 Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex.
-Therefore the nearest command is mostly the nearest point of the surface ``conditioning = least``.
-It is found by sequential quadratic programming, and the path is checked. Where the check fails, the
-search is repeated with a larger conditioning as its aim. Where that fails too, the command is moved
-towards the last one.
+Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning =
+least``. This point is found by sequential quadratic programming, and its path is checked. If the
+check fails, the search is repeated with a larger conditioning as its aim. If all searches fail, the
+command is moved towards the last command.
 
-Where a task bounds the accelerations of commands, a robot cannot hold the last command at once.
-There :class:`BrakingShield` allows only commands after which the robot can still brake in time.
+If a task bounds the accelerations of commands, a robot cannot hold the last command at once. For
+such tasks, :class:`BrakingShield` allows only commands after which the robot can brake in time.
 
 Importing this module imports Numba.
 """
@@ -35,11 +35,12 @@ from tpm_gym.tasks.control import Control, Follower
 __all__ = ["BrakingShield", "Shield", "make_shield"]
 
 MARGIN = 0.15
-"""Extra conditioning to keep with servo drives or other plants, as a fraction of the safe one."""
+"""Extra conditioning for servo drives or randomised plants, as a fraction of the safe value."""
 TOLERANCE = 2e-5
 """Amount by which the conditioning at commands should exceed ``least``.
 
-The check of a path demands half of it; the other half is a reserve for errors between the nodes.
+The check of a path requires half of this amount. The other half is a reserve for errors between
+the nodes.
 """
 _FAR = 1.05
 """If the conditioning at three successive commands is at least this multiple of ``Shield.least``,
@@ -84,8 +85,9 @@ class Shield:
     """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
     Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
-    control, increments of the joints with joint control. They are measured from the command to
-    which the control converts the action. No safe command is nearer by more than 0.003.
+    control, increments of the joints with joint control. They are measured from the wanted command,
+    which the control computes from the action. The returned command is at most 0.003 of these
+    units farther from the wanted command than the nearest safe command is.
 
     Args:
         machine: Nominal machine.
@@ -188,15 +190,15 @@ class Shield:
 class BrakingShield:
     """Shield of Cycle: replaces commands after which robots could not brake in time.
 
-    A command is safe if the conditioning stays at ``least`` or above on its path, and while the
-    robot brakes after it as hard as the follower allows. No torque may exceed the motors' peak. So
-    it is always safe to brake: braking after the last command was part of the check of that
-    command. An unsafe command is moved in a straight line towards the command with which the robot
-    brakes.
+    After a command, the robot can brake as hard as the ``follower`` allows. The command is safe if,
+    on the path to it and while the robot then brakes, the conditioning stays at ``least`` or above
+    and no torque exceeds the motor's peak torque. So it is always safe to brake: the check of the
+    last command included the braking after it. An unsafe command is moved in a straight line
+    towards the command with which the robot brakes.
 
     Args:
         machine: Nominal machine.
-        follower: Limit of commands to what the motors can follow.
+        follower: Limit of commands to motions that the motors can follow.
         least: Smallest conditioning on the path of the commands.
     """
 
@@ -207,8 +209,8 @@ class BrakingShield:
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
         """Return safe commands (n, 3) m between the braking commands and the wanted ones.
 
-        If even braking leads below ``least``, the smallest conditioning with the returned command
-        is no smaller than with braking.
+        If even braking leads to a conditioning below ``least``, the returned command is no worse:
+        the smallest conditioning on its path is at least that on the path of braking.
 
         Args:
             wanted: (n, 3) m, commands by control and follower, machine's frame.
@@ -259,13 +261,13 @@ def make_shield(
         shield: True, or the conditioning to keep.
         machine: Nominal machine.
         control: Control of the environment.
-        follower: Limit of its commands, if their accelerations are bounded.
+        follower: Limit of the control's commands, if their accelerations are bounded.
         exact: Whether the robot follows its commands exactly. If not, True adds the ``MARGIN``.
 
     Raises:
         ConfigurationError: If the option is neither True nor a number in (0, 1], if the
-            conditioning at home is below the one to keep, or if the machine is made to pass a
-            singularity.
+            conditioning at home is below the conditioning to keep, or if the machine may pass a
+            parallel singularity.
     """
     if machine.mirror_axis is not None:
         valid = f"False: {machine.name!r} has to pass a singularity here"
@@ -326,8 +328,9 @@ def solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Solve problems with linearised conditioning, by Hildreth's method.
 
-    For each constraint in turn, the point is pushed until the constraint holds with equality. It is
-    moved back at most as far as this constraint has pushed it before.
+    For each constraint in turn, the point is pushed until the constraint holds with equality. If
+    the constraint holds with a reserve, the point is moved back, but not farther than this
+    constraint has pushed it in total.
 
     Args:
         point: (r, 3) m, where the conditioning is linearised.

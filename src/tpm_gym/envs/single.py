@@ -78,7 +78,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     Commands accumulate and are projected into the task region; P follows them along a B-spline. The
     region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
     turns of the joints move P far along y. Therefore the limit for P scales most random joint
-    actions down to a tenth, all three joints by one factor. Cycle has control steps of 4 ms,
+    actions down to a tenth, with one factor for all three joints. Cycle has control steps of 4 ms,
     smaller increments and bounded accelerations.
 
     ## Observation
@@ -96,7 +96,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_offset | 3 | top of the object minus lip of the cup |
     | object_velocity | 3 | velocity of the object, from a camera |
     | object_tilt | 2 | x and y of the object's axis |
-    | object_held | 1 | share of the vacuum that holds the object, by a gauge |
+    | object_held | 1 | vacuum / largest vacuum, by a gauge, if the object is held; else 0 |
 
     The entries of the object are repeated for each object. Push adds the object's turn about the
     vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,
@@ -118,7 +118,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | goal, dense | minus the distance in units of 0.1 m; Cycle: steeper within 10 mm of the goal |
     | singularity | -penalty_weight x (1 - (c / 0.08)^4) where c = 1/cond(J) < 0.08, else 0 |
     | approach | minus half the distance from cup to block in units of 0.1 m |
-    | gate | minus the depth of P below the gate, in units of 5 mm |
+    | gate | -(d - 2 mm) / 5 mm, at most 0; d is the depth of P below Cycle's gate-shaped path |
 
     SB3's HerReplayBuffer calls ``compute_reward`` with an empty info, which gives the goal term
     alone. ``tpm_gym.learning.PenaltyHerReplayBuffer`` keeps the other terms; so does SB3's buffer
@@ -145,7 +145,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
     | ``object_lost`` | whether an object is off the table or out of reach |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
-    | ``randomisation`` | after a reset with that option: the episode's plant |
+    | ``randomisation`` | the episode's plant; only from reset(), with the option of this name |
 
     Crossing adds ``crossed``: whether P is on the other side of y = 0 than home. Push adds
     ``toppled``: whether the block lies on a side.
@@ -153,9 +153,10 @@ class TPMEnv(gym.Env[Observation, Action]):
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 
     Past a parallel singularity the encoders no longer determine the platform's position. Then the
-    penalty is 1 and the episode is truncated. With the nominal robot and ideal drives, no action
-    leads past one, except in Cycle: there, adversarial actions at full speed can need more torque
-    than the motors have. ``shield=True`` prevents it.
+    penalty is 1 and the episode is truncated, except in Crossing. With the nominal robot and ideal
+    drives, no action leads past a parallel singularity, except in Crossing and in Cycle. In Cycle,
+    adversarial actions at full speed can need more torque than the motors have; ``shield=True``
+    prevents this.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
@@ -173,10 +174,11 @@ class TPMEnv(gym.Env[Observation, Action]):
             a singularity; only for machines whose goals are near a singularity.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
-            100 N m at any speed. ``"servo"``, a :class:`~tpm_gym.simulation.Servo` or a mapping of
-            its attributes lags behind the references. Its defaults for stiffness and damping are
-            7500 N m/rad, 60 N m s/rad; the torques of the nominal motion are fed forward. Its
-            largest torque is 100 N m up to 18.75 rad/s, and falls to zero at 25 rad/s.
+            100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references. It
+            has the stiffness 7500 N m/rad and the damping 60 N m s/rad; the torques of the nominal
+            motion are fed forward. Its largest torque is 100 N m up to 18.75 rad/s, and falls to
+            zero at 25 rad/s. For a servo drive with other parameters, give a
+            :class:`~tpm_gym.simulation.Servo` or a mapping of its attributes.
         randomisation: Differences from the nominal machine, drawn for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Position and
             velocity keep their last values while disturbed encoders report joint positions that
@@ -316,7 +318,7 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
-            EpisodeError: If there is no episode: before reset, after close, after a lost loop.
+            EpisodeError: If there is no episode: before reset, after close or after a ClosureError.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
             ConfigurationError: If a result of the task is not finite.
@@ -343,8 +345,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     ) -> Any:
         """Compute the reward of a transition, or of a batch of them, for any goal.
 
-        Terms that do not depend on the goal are taken from ``info``. They are left out where it is
-        empty, as SB3's HerReplayBuffer passes it, so that the goal term remains.
+        Terms that do not depend on the goal are taken from ``info``. If ``info`` is empty, the
+        result is the goal term alone; SB3's HerReplayBuffer passes an empty ``info``.
 
         Args:
             achieved_goal: (..., goal size) m.
@@ -412,8 +414,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     def save_state(self) -> EnvSnapshot:
         """Return physics, rng, goal, delayed actions and grasp.
 
-        Steps from here, and steps after :meth:`restore_state`, are equal to the last bit. The
-        count of the wrapper ``TimeLimit`` is not part of the snapshot.
+        Steps from here and steps after :meth:`restore_state` agree in every bit. The step count of
+        the wrapper ``TimeLimit`` is not part of the snapshot.
 
         Raises:
             EpisodeError: If no episode is running.

@@ -100,7 +100,7 @@ def bits(value: Any) -> Any:
 
 
 def play(env: Env, actions: Iterable[Any]) -> list[Any]:
-    """Return the bits of each step's results, and of the whole state behind them."""
+    """Return the bits of the results of each step, and of the state after the step."""
     return [(bits(env.step(action)), _state_of(env)) for action in actions]
 
 
@@ -114,7 +114,7 @@ def _require(promise: str, kept: Any, found: str = "this does not hold") -> None
 
 
 def _refused(call: Callable[[], Any], *kinds: type[TPMError]) -> TPMError:
-    """Call a function that has to raise one of some errors, and return the error."""
+    """Call a function that must raise one of the errors ``kinds``, and return its error."""
     names = " or ".join(kind.__name__ for kind in kinds)
     try:
         call()
@@ -129,7 +129,7 @@ def _refused(call: Callable[[], Any], *kinds: type[TPMError]) -> TPMError:
 
 
 def passes_the_checkers_of_gymnasium_and_sb3(make: Make) -> None:
-    """Run the checkers of other packages; Stable-Baselines3's where it is installed."""
+    """Run Gymnasium's checker, and Stable-Baselines3's checker if the package is installed."""
     sb3 = None
     if find_spec("stable_baselines3") is not None:  # its own warnings are no errors
         sb3 = importlib.import_module("stable_baselines3.common.env_checker")
@@ -176,7 +176,7 @@ def gives_observations_of_order_one_and_plain_infos(make: Make) -> None:
 
 
 def truncates_episodes_at_their_last_step(make: Make) -> None:
-    """Count the steps of an episode."""
+    """Check that an episode is truncated at its last step, and never terminated."""
     with closing(make()) as env:
         env.reset(seed=0)
         steps = _steps_of(env)
@@ -193,7 +193,7 @@ def _steps_of(env: Env) -> int:
 
 
 def repeats_resets_with_the_seed(make: Make) -> None:
-    """Compare the goals of equal and other seeds."""
+    """Compare the goals after resets with equal seeds, different seeds and no seed."""
     with closing(make()) as env:
         first, second, again = (env.reset(seed=seed)[0]["desired_goal"] for seed in (3, 4, 3))
         last = env.reset()[0]["desired_goal"]
@@ -277,7 +277,7 @@ def refuses_bad_actions_and_has_not_moved_then(make: Make) -> None:
 
 
 def clips_actions_and_leaves_them_as_they_are(make: Make) -> None:
-    """Compare actions at the end of their space with larger ones."""
+    """Compare the results of actions at the bounds of the action space and of larger actions."""
 
     def run(env: Env, size: float) -> Any:
         env.reset(seed=10)
@@ -376,7 +376,7 @@ def continues_copies_and_snapshots_equally(make: Make) -> None:
 
 
 def gives_the_rows_of_its_vector_environment(make: Make) -> None:
-    """Compare every row of a vector environment with the environment alone."""
+    """Compare every row of a vector environment with a single environment."""
     with closing(make()) as env:
         spec: Any = copy.deepcopy(env.spec)
         spec.kwargs.pop("render_mode", None)
@@ -418,7 +418,10 @@ def survives_json(make: Make) -> None:
 
 
 def is_solved_by_its_expert(make: Make) -> None:
-    """Check that the expert succeeds with seeds 0 and 1; skipped with pixels or without a plan."""
+    """Check that the expert succeeds with seeds 0 and 1.
+
+    The check is skipped for pixel observations, and for tasks without a plan for the expert.
+    """
     with closing(make()) as env:
         if "pixels" in getattr(env.observation_space, "spaces", ()):
             return

@@ -43,9 +43,9 @@ Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     """n environments that are stepped together.
 
-    Spaces, rewards, seeds and infos are as in :class:`~tpm_gym.TPMEnv`. In the analytic engine, an
-    environment computes equal bits alone and among thousands, on one thread and on several. Infos
-    have the form of Gymnasium's vector environments, a mask ``_key`` beside each ``key``.
+    Spaces, rewards, seeds and infos are as in :class:`~tpm_gym.TPMEnv`. In the analytic engine, the
+    results of an environment agree in every bit, whatever the number of environments and threads.
+    Infos have the form of Gymnasium's vector environments, with a mask ``_key`` for each ``key``.
 
     Args:
         task: See :class:`~tpm_gym.TPMEnv`.
@@ -215,7 +215,10 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return [None if own is None else seeding.np_random(int(own))[0] for own in seeds]
 
     def step(self, actions: NDArray[Any]) -> Step:
-        """Run one control step in all environments, or reset those whose episode ended.
+        """Run one control step in each environment, and reset environments whose episode ended.
+
+        With ``NEXT_STEP``, the reset replaces the next control step of the environment. With
+        ``SAME_STEP``, it follows the last control step of the episode at once.
 
         Raises:
             ActionError: If the actions have the wrong shape or are not finite.
@@ -235,7 +238,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return observation, reward, np.zeros_like(ended), ended, info
 
     def _require_running(self) -> None:
-        """Raise if the environments are closed, or one needs a reset by the user."""
+        """Raise EpisodeError if the environments are closed, or if the user must reset some."""
         if self.closed:
             self._require_open()
         begun = all(part.core.rngs for part in self._parts)
@@ -277,7 +280,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
         Args:
             count: Number of environments; all of them if there are fewer.
-            columns: Pictures in each line; None for about as many as there are lines.
+            columns: Pictures in each line; with None, there are about as many columns as lines.
 
         Raises:
             ConfigurationError: If ``render_mode`` is None or ``"rgbd_tuple"``.
@@ -435,7 +438,7 @@ class _Part:
         return observation, reward, ended, infos
 
     def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
-        """Reset ended environments and replace their observations; return old and new infos."""
+        """Reset ended environments, replace their observations, and return old and new infos."""
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
         for row in rows.tolist():
@@ -483,7 +486,7 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
-    """Add a mask to each entry (n,): true in ``rows``, or everywhere without ``rows``."""
+    """Add a mask (n,) for each entry: true in ``rows``, or everywhere if ``rows`` is None."""
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
         mask[:] = False
@@ -497,7 +500,7 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return copies of the entries of ``last``, with the values of ``first`` in some rows."""
+    """Return a copy of a step's infos ``last``, with new episodes' infos ``first`` in ``rows``."""
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):
@@ -521,7 +524,7 @@ def _add(infos: dict[str, Any], info: Mapping[str, Any], row: int, count: int) -
 
 
 def _joined(infos: Sequence[Mapping[str, Any]], counts: Sequence[int]) -> dict[str, Any]:
-    """Join the infos of parts; entries that a part lacks are empty there."""
+    """Join the infos of parts; entries that a part lacks are 0 or None in its rows."""
     joined: dict[str, Any] = {}
     for name in dict.fromkeys(name for info in infos for name in info):
         values = [info.get(name) for info in infos]

@@ -1,16 +1,18 @@
 """Closed-form equations of the mechanism, for floats, arrays and tensors.
 
-The paper's frame O-xyz: origin in the middle of the base, base plane z = 0, z from the base towards
-the platform; metres and radians. The mechanism has two loops of coupling degree zero, so forward
-and inverse kinematics reduce to intersections of circles. These are solved as vectors and as
-``a cos + b sin = c``, not with the paper's half-angle forms (Eqs. 13 and 15), which break where
-``g_i = 0`` or ``theta_i = pi``.
+The paper's frame O-xyz has its origin in the middle of the base. The base lies in the plane z = 0,
+and z points from the base towards the platform. Units are metres and radians. The mechanism has two
+loops of coupling degree zero, so forward and inverse kinematics reduce to intersections of circles.
+The intersections are computed with vectors, or from equations ``a cos + b sin = c``. The paper's
+half-angle forms (Eqs. 13 and 15) are not used, because they fail where ``g_i = 0`` or
+``theta_i = pi``.
 
 The functions compute with the numbers of their namespace ``ns``: arrays and tensors
 (:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code
 (:mod:`tpm_gym.kinematics.compiled`). Components (x, y, z or theta_1 to theta_3) are separate
 numbers (...,), and signs of branches broadcast with them. The functions check and raise nothing.
-Beside a solution they return whether it is real, and the lengths that explain why it is not.
+Besides a solution, they return whether the solution is real, and the lengths that explain why it is
+not real.
 """
 
 import math
@@ -30,11 +32,12 @@ ROUNDING = 64 * sys.float_info.epsilon
 Where two solutions merge, rounding can make it negative although the solutions exist."""
 _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
-"""Limit below which a factor of det A, divided by lengths, counts as zero. For sin(beta) and the
-paper's lengths, this is 50 nm in y. cos(beta) has an error of about 1e-14. So near cos(beta) = 1,
-sin(beta) has an error of about 1e-7, which is below the limit."""
+"""Limit below which a factor of det A, divided by lengths, counts as zero. With the paper's
+lengths, sin(beta) is below this limit where P is less than 50 nm from y = 0. cos(beta) has an error
+of about 1e-14. So near cos(beta) = 1, sin(beta) has an error of about 1e-7, which is below the
+limit."""
 LEAST = 1e-30
-"""Smallest det A, m^3, for which the conditioning is computed. For a smaller one, terms of the
+"""Smallest det A, m^3, for which the conditioning is computed. For a smaller det A, terms of the
 conditioning could overflow."""
 
 _TINY = sys.float_info.min  # the smallest divisor
@@ -48,15 +51,15 @@ class LegLengths(Protocol):
 
     @property
     def l3(self) -> Numbers:
-        """Arms A_iB_i."""
+        """Length of the arms A_iB_i."""
 
     @property
     def l4(self) -> Numbers:
-        """Rods B_iC_i."""
+        """Length of the rods B_iC_i."""
 
 
 class Assembly(NamedTuple):
-    """The mechanism assembled at three actuated angles: P and C1 in m, and link 7's direction."""
+    """Mechanism assembled at three actuated angles: P and C1, m, and the direction of link 7."""
 
     x: Numbers
     y: Numbers
@@ -70,14 +73,16 @@ class Assembly(NamedTuple):
 class Factors(NamedTuple):
     """Factors of det A (Eq. 16, corrected) and of det B (Eq. 17, corrected), and the elevation.
 
-    A configuration is singular where one of them is zero.
+    A configuration is singular where a factor or the elevation is zero.
 
     Attributes:
-        level3: l1 + l3 c3 - xC - 2 l2, m.
-        planar: Zero where B1C1 and B2C2, projected on y = 0, line up, m^2.
-        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad: zero where the leg is stretched or folded.
-        elevation: z_C1 - z_B1, m: where it is zero, the rods of the 4S parallelogram no longer keep
-            link 3' from turning about y, a constraint singularity.
+        level3: l1 + l3 cos(theta_3) - xC - 2 l2, m.
+        planar: Cross product, m^2, of B1C1 and B2C2 projected on y = 0; zero where they line up.
+        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad; zero where leg 1 is stretched or folded.
+        leg2: B_2C_2 . dB_2/dtheta_2, m^2/rad.
+        leg3: B_3C_3 . dB_3/dtheta_3, m^2/rad.
+        elevation: z_C1 - z_B1, m. Zero is a constraint singularity: there, the rods of the 4S
+            parallelogram no longer keep link 3' from turning about y.
     """
 
     sin_beta: Numbers
@@ -115,15 +120,22 @@ def assembly_at(
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers, Numbers]]:
     """Solve forward kinematics (Eqs. 6 to 11, corrected) for signs of planar factor and sin(beta).
 
-    Eq. (6): C1 is on the circle about (0, z1) with radius^2 = l4^2 - y1^2 and on the circle about
-    (dx, z1 + dz) with radius l4. The intersection on the left of the line from the first to the
-    second centre has a positive planar factor, the other intersection a negative one.
+    Eq. (6): in the plane y = 0, C1 is on two circles. With the elbow B1 at (0, y1, z1), the first
+    circle has the centre (0, z1) and radius^2 = l4^2 - y1^2. The second circle has the radius l4.
+    Its centre (dx, z1 + dz) is the elbow B2 displaced by 2 l5 along x. The intersection on the left
+    of the line from the first to the second centre has a positive planar factor, the other
+    intersection a negative one.
 
     Returns:
-        The assembly; whether it is real; and five values that explain why it is not: whether xC and
-        zC are real and rod 11 fits; y1, m; the squared distance of the circles' centres, m^2; and
-        the level and the vertical distance from B3 to C3 for a link 7 of length 0, m. If rod 11
-        fits although the assembly is not real, then a2 = b2 = 0, and rod 11 fits for every beta.
+        The assembly, whether it is real, and five values that explain why it is not. In this order,
+        the values are:
+
+        * whether the circles meet and rod 11 fits. If this is true although the assembly is not
+          real, then a2 = b2 = 0 in Eq. (10), and rod 11 fits for every beta;
+        * y1, m;
+        * the squared distance of the circles' centres, m^2;
+        * for a link 7 of length 0, the horizontal distance from B3 to C3, m;
+        * for a link 7 of length 0, the vertical distance from B3 to C3, m.
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]
@@ -158,10 +170,14 @@ def posture_at(
     """Solve inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
 
     Returns:
-        theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi): arms 1 and 3 point inwards at pi,
-        arm 2 at 0. Whether they are real. xC, zC, cos(beta) and sin(beta). For :func:`leg_margin`,
-        distances of C_i from A_i in the arm's plane, m: the level distances of legs 1, 2 and 3, and
-        the vertical distance of leg 3.
+        Four results, in this order.
+
+        * the angles: theta_1 and theta_3 in (-pi, pi], theta_2 in [0, 2 pi). Arms 1 and 3 point
+          inwards at pi, arm 2 at 0;
+        * whether the angles are real;
+        * xC, zC, cos(beta) and sin(beta);
+        * for :func:`leg_margin`, distances of C_i from A_i in the arm's plane, m: the horizontal
+          distances of legs 1, 2 and 3, and the vertical distance of leg 3.
     """
     x, y, z = point
     side, bend1, bend2, bend3 = signs
@@ -182,18 +198,21 @@ def posture_at(
 def arm(
     a: Numbers, b: Numbers, out: Numbers, bend: Numbers, g: LegLengths, ns: Namespace
 ) -> tuple[Numbers, Numbers]:
-    """Compute the arm's angle in (-pi, pi] from |C - A - l3 e(theta)| = l4.
+    """Compute the arm's angle theta in (-pi, pi] from |C - A - l3 e(theta)| = l4.
+
+    Here e(theta) is the unit vector along the arm.
 
     Args:
-        a: Distance of C from A, level in the arm's plane, m.
-        b: Vertical distance, m.
-        out: Distance out of the arm's plane, m.
-        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); names one of two solutions.
+        a: Horizontal distance of C from A in the arm's plane, m.
+        b: Vertical distance of C from A, m.
+        out: Distance of C from the arm's plane, m.
+        bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); it selects one of the two
+            solutions.
         g: Lengths.
         ns: Namespace.
 
     Returns:
-        The angle, and whether the leg reaches.
+        The angle, and whether the leg reaches C.
     """
     l3, l4 = g.l3, g.l4
     radius2 = a * a + b * b
@@ -249,8 +268,8 @@ def link_velocity(
 ) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers], Triple]:
     """Compute the rates of xC, zC and l7 beta for unit rates of the motors, m/rad.
 
-    The rates solve the derivatives of the closures, with determinant l7 sin(beta) level3 planar.
-    Motor 3 does not move link 3'.
+    The rates solve a linear system, the derivatives of the closures by time. The determinant of
+    this system is sin(beta) * level3 * planar. Motor 3 does not move link 3'.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
     # Divisions take longer than all else, so each divisor is inverted once.
@@ -262,7 +281,7 @@ def link_velocity(
 
 
 def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Triple, Triple, Triple]:
-    """Compute the rows of J, v = J theta_dot, m/rad; it exists at serial singularities too."""
+    """Compute the rows of J, v = J theta_dot, m/rad; J exists at serial singularities too."""
     sin_beta, cos_beta = values.sin_beta, values.cos_beta
     (x1, x2), (z1, z2), (turn1, turn2, turn3) = link_velocity(bars, values)
     return (
@@ -273,12 +292,12 @@ def velocity(bars: tuple[Triple, Triple, Triple], values: Factors) -> tuple[Trip
 
 
 def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
-    """Compute smallest over largest singular value, s3 / s1, of a matrix (3, 3).
+    """Compute smallest over largest singular value, s3 / s1, of a matrix M (3, 3).
 
-    |det| = s1 s2 s3, and the matrix of cofactors has the largest singular value s1 s2. So this is
-    |det| divided by s1 and by s1 s2. If s3 were computed as the root of the smallest eigenvalue of
-    J J^T, half of its digits would be lost. Where s1 and s2 nearly coincide, the result is accurate
-    to 1e-9 only.
+    |det M| = s1 s2 s3, and the matrix of cofactors has the largest singular value s1 s2. So s3 / s1
+    is |det M| divided by s1 and by s1 s2. If s3 were computed as the root of the smallest
+    eigenvalue of M M^T, half of its digits would be lost. Where s1 and s2 nearly coincide, the
+    result is accurate to 1e-9 only.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     first = (e * i - f * h, f * g - d * i, d * h - e * g)
@@ -292,7 +311,7 @@ def conditioning(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
 def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) -> Numbers:
     """Compute the largest singular value of M, the root of the largest eigenvalue of M M^T.
 
-    The eigenvalues are the trigonometric roots of the characteristic polynomial.
+    The eigenvalue comes from the trigonometric formula for the characteristic polynomial's roots.
     """
     (a, b, c), (d, e, f), (g, h, i) = rows
     xx, yy, zz = a * a + b * b + c * c, d * d + e * e + f * f, g * g + h * h + i * i
@@ -310,7 +329,7 @@ def _largest_singular_value(rows: tuple[Triple, Triple, Triple], ns: Namespace) 
 
 
 def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> UnreachableError:
-    """Explain which loop does not close on a branch at theta (3) rad, and by how much."""
+    """Explain which loop does not close in an assembly mode at theta (3,) rad, and by how much."""
     with np.errstate(all="ignore"):
         cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
         _, _, found = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
@@ -330,7 +349,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
 
 
 def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableError:
-    """Explain which leg does not reach a point (3) m on a branch, and by how much."""
+    """Explain which leg does not reach a point (3,) m in a working mode, and by how much."""
     hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
     beyond = g.l7 - abs(point[1])
     if beyond < 0:
@@ -345,9 +364,13 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 
 
 def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
-    """Return the margin by which a leg reaches, m; negative if it does not.
+    """Return the margin by which a leg reaches C, m; negative if the leg does not reach C.
 
-    Distances of C from A in m: level and vertical in the arm's plane, and out of it.
+    Args:
+        level: Horizontal distance of C from A in the arm's plane, m.
+        vertical: Vertical distance of C from A, m.
+        out: Distance of C from the arm's plane, m.
+        g: Lengths.
     """
     if abs(out) >= g.l4:
         return g.l4 - abs(out)

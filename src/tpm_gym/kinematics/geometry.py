@@ -1,4 +1,4 @@
-"""Seven lengths that define the mechanism, validated."""
+"""Seven lengths that define the mechanism, with their checks."""
 
 from dataclasses import dataclass, fields
 from typing import NamedTuple
@@ -8,13 +8,13 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Fraction of l1 below which a length counts as 0. If l1 - l3 (the smallest y_B1) counts as 0, and
-so does l5 or |l5 - l1|, the circles of Eq. (6) can nearly coincide. Their intersections would be
-inaccurate."""
+"""Limit, as a fraction of l1, below which a length counts as 0. If l1 - l3 (the smallest y_B1) is
+below the limit, and l5 or |l5 - l1| is below it too, the circles of Eq. (6) can nearly coincide.
+Their intersections would be inaccurate."""
 
 
 class Lengths(NamedTuple):
-    """Lengths l1 to l7, m, as any kind of numbers, such as tensors; they are not checked."""
+    """Lengths l1 to l7, m, as any kind of numbers, such as tensors, without checks."""
 
     l1: Numbers
     l2: Numbers
@@ -32,11 +32,11 @@ class Geometry:
     Attributes:
         l1: Half side of the base: distance from O to each actuated pivot A_i.
         l2: Half side of the platform: F1 to P and P to D3.
-        l3: Actuated arms A_iB_i (links 2, 5 and 12).
-        l4: Rods B_iC_i (link 6 and the long links of both parallelograms).
-        l5: Half the short links of both parallelograms.
-        l6: Vertical offsets C_1D_1, E_1F_1 and C_3D_3. May be zero.
-        l7: Link 7, D_1E_1; the workspace reaches y = -l7 to l7.
+        l3: Length of the actuated arms A_iB_i (links 2, 5 and 12).
+        l4: Length of the rods B_iC_i (link 6 and the long links of both parallelograms).
+        l5: Half the length of the short links of both parallelograms.
+        l6: Vertical offsets C_1D_1, E_1F_1 and C_3D_3; may be zero.
+        l7: Length of link 7, D_1E_1; the workspace extends from y = -l7 to l7.
 
     Raises:
         GeometryError: If a length is no finite positive number (l6 may be 0), if rods 4a and 4b
@@ -88,12 +88,12 @@ def require_geometry(geometry: object) -> None:
 
 
 PAPER = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.050)
-"""The paper's case study (section "Case study"), there in millimetres."""
+"""Lengths of the paper's section "Case study", where they are in millimetres."""
 
 WIDE = Geometry(l1=0.300, l2=0.070, l3=0.350, l4=0.800, l5=0.100, l6=0.010, l7=0.600)
 """The paper's lengths with a longer l7, for a workspace of practical depth in y.
 
 Values of l7 from 0.1 to 0.9 m in steps of 0.1 m were compared by their largest axis-aligned box
-with a conditioning of at least 0.1, elbows out (:func:`tpm_gym.analysis.aspects.largest_box`). The
-box is largest for 0.6 m: about 45 litres, 0.3 m deep in y. PAPER has 3 litres, 0.02 m deep.
+with a conditioning of at least 0.1 and elbows out (:func:`tpm_gym.analysis.aspects.largest_box`).
+The box is largest for 0.6 m: about 45 litres, 0.3 m deep in y. PAPER has 3 litres, 0.02 m deep.
 """

@@ -1,12 +1,13 @@
-"""Jacobians, their singular factors, and conditioning, batched, in the paper frame.
+"""Jacobians, their singular factors, and conditioning, for batches, in the paper frame.
 
-With f_i = |B_iC_i|^2 - l4^2 = 0 and the platform velocity v, differentiation gives
-A v = B theta_dot (section "Singularity analysis"). Configurations are given by the actuated angles
-``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and the
-working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
+The closures are f_i = |B_iC_i|^2 - l4^2 = 0. Their derivatives by time are A v = B theta_dot, with
+the platform's velocity v (section "Singularity analysis"). Configurations are given by the actuated
+angles ``theta`` (..., 3) in rad and the assembly mode, or by points ``position`` (..., 3) in m and
+the working mode. Torch tensors give tensors, as in :mod:`tpm_gym.kinematics.position`.
 
 All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions of angles
-raise it also if theta is not finite, and UnreachableError if the branch does not exist somewhere.
+also raise InputError if theta is not finite, and UnreachableError if the assembly mode does not
+exist at some theta.
 """
 
 import math
@@ -136,8 +137,8 @@ def conditioning_at(
 ) -> FloatArray:
     """Compute 1/cond(J) at points, (...,).
 
-    It is 0 unless a point is reachable in the working mode ``branch`` and in the assembly mode
-    ``assembly``.
+    The result is 0 unless a point is reachable in the working mode ``branch`` and in the assembly
+    mode ``assembly``.
 
     To differentiate by the lengths, pass points as a tensor and the lengths as tensors in a
     :class:`tpm_gym.kinematics.geometry.Lengths`.
@@ -177,14 +178,19 @@ def factors(
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
-    """Compute the factors at points, accurately at singularities too; NaN where out of reach."""
+    """Compute factors at points; they are accurate at singularities too, and NaN out of reach."""
     return Factors(*_from_points(lambda c: c.factors, position, branch, geometry, math.nan))
 
 
 def _regular(
     results: _Results, theta: ArrayLike, branch: AssemblyMode, g: Geometry
 ) -> list[FloatArray]:
-    """Compute results; raise SingularityError for the smallest factor if J does not exist."""
+    """Compute results for configurations in which J exists.
+
+    Raises:
+        SingularityError: If J does not exist in a configuration; the error names the smallest
+            factor of det A.
+    """
     singular, *found = _from_angles(lambda c: [c.factors[:3], *results(c)], theta, branch, g)
     names = "sin(beta)", "(l1 + l3 cos(theta_3) - xC - 2 l2) / l4", "planar factor / l4^2"
     scaled = [singular[..., i].reshape(-1) / (1.0, g.l4, g.l4**2)[i] for i in range(3)]
@@ -217,7 +223,7 @@ def _from_angles(
 def _from_points(
     results: _Results, position: ArrayLike, branch: WorkingMode, g: AnyLengths, missing: float
 ) -> list[FloatArray]:
-    """Compute results for configurations at points; ``missing`` where there is none."""
+    """Compute results for configurations at points; ``missing`` where a point is out of reach."""
 
     def text(point: equations.Triple, ns: Namespace) -> list[Numbers]:
         theta, real, link7, _ = equations.posture_at(point, branch.signs, g, ns)
@@ -246,7 +252,7 @@ def _velocity(c: _Configuration) -> Numbers:
 
 
 def _conditioning(c: _Configuration) -> Numbers:
-    """Compute the conditioning, and 0 where J does not exist."""
+    """Compute the conditioning; 0 where J does not exist."""
     values, ns = c.factors, c.ns
     exists = abs(values.planar * values.sin_beta * values.level3) > equations.LEAST
     # Otherwise, the derivatives of all rows by the lengths would be NaN.

@@ -18,7 +18,7 @@ from tpm_gym.kinematics.namespaces import namespace_of
 
 
 class _Mode:
-    """A branch, named by its signs."""
+    """Branch that is named by its signs."""
 
     def __post_init__(self) -> None:
         """Reject anything but signs; store them as ints."""
@@ -44,8 +44,8 @@ class AssemblyMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16).
-            It is the side of the line through the two circle centres on which link 3' is.
-        sin_beta: Sign of sin(beta), and so of y: the half in which the platform is assembled.
+            It gives the side of the line through both circles' centres (Eq. 6) on which C1 lies.
+        sin_beta: Sign of sin(beta), and so of y: the side of y = 0 on which the platform is.
     """
 
     planar: int
@@ -74,12 +74,12 @@ class RotatedMode(_Mode):
     """Branch of the forward kinematics in the second operation mode, one of 8.
 
     Attributes:
-        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`: the side on
-            which rod 6 passes the point where rods 4a and 4b cross, as seen along y. Where rods 4a
-            and 4b, seen along y, are shorter than links 3 and 3', -1 names the two assemblies of
-            link 3' with the smaller planar factors.
-        further: Names one of the two assemblies of link 3' with the same ``planar``: -1 has the
-            smaller tilt phi in [0, 2 pi), 1 the larger one.
+        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`. It gives
+            the side on which rod 6 passes the point where rods 4a and 4b cross, as seen along y. If
+            rods 4a and 4b, seen along y, are shorter than links 3 and 3', ``planar`` is -1 for the
+            two assemblies of link 3' with the smaller planar factors.
+        further: Sign that selects one of the two assemblies of link 3' with the same ``planar``: -1
+            for the smaller tilt phi in [0, 2 pi), 1 for the larger tilt.
         sin_beta: Sign of sin(beta), and so of y.
     """
 
@@ -95,20 +95,20 @@ def require_mode(branch: object, kind: type[_Mode]) -> None:
 
 
 ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))
-"""All forward branches, in the order of the slots of :func:`forward_all`."""
+"""All branches of the forward kinematics, in the order of the slots of :func:`forward_all`."""
 
 ROTATED_MODES = tuple(RotatedMode(*signs) for signs in product((-1, 1), repeat=3))
-"""All forward branches with link 3' turned, in the order of the slots of
+"""All branches of the forward kinematics with link 3' turned, in the order of the slots of
 :func:`tpm_gym.kinematics.rotated.forward_rotated`."""
 
 WORKING_MODES = tuple(WorkingMode(*signs) for signs in product((-1, 1), repeat=4))
-"""All inverse branches, in the order of the slots of :func:`inverse_all`."""
+"""All branches of the inverse kinematics, in the order of the slots of :func:`inverse_all`."""
 
 DEFAULT_ASSEMBLY = AssemblyMode(planar=-1, sin_beta=1)
 """Assembly mode of the environments: the platform is at y > 0, on the side z > 0 of the base."""
 
 ELBOWS_OUT = WorkingMode(cos_beta=1, leg1=1, leg2=-1, leg3=1)
-"""Working mode of the environments: arms bent away from the centre, as a delta robot's."""
+"""Working mode of the environments: the elbows point away from the centre, as in a Delta."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,9 @@ class ForwardSolutions:
     """All solutions of the forward kinematics, one slot per :data:`ASSEMBLY_MODES` entry.
 
     Attributes:
-        position: (..., 4, 3) m, point P in the paper frame; NaN where not real. Where beta is
-            free, z alone is a number.
-        beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where not real.
+        position: (..., 4, 3) m, point P in the paper frame; NaN where the branch is not real. Where
+            the mechanism closes for every beta (see ``free``), x and y are NaN, but z is not.
+        beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where the branch is not real.
         valid: (..., 4) bool, whether the branch is real.
         geometry: Lengths of the mechanism.
     """
@@ -130,7 +130,7 @@ class ForwardSolutions:
 
     @property
     def free(self) -> BoolArray:
-        """(..., 4) bool, whether the mechanism closes for every beta, at a2 = b2 = 0 of Eq. (10).
+        """(..., 4) bool, whether the loops close for every beta, because a2 = b2 = 0 in Eq. (10).
 
         The platform can then move along a circle with all motors held, and no branch is valid.
         """
@@ -140,7 +140,7 @@ class ForwardSolutions:
 
     @property
     def link3(self) -> FloatArray:
-        """(..., 4, 2) m, (xC, zC) of point C1 of link 3'; NaN where not real."""
+        """(..., 4, 2) m, (xC, zC) of point C1 of link 3'; NaN where the branch is not real."""
         g = self.geometry
         ns = namespace_of(self.beta)
         x_c = self.position[..., 0] - g.l2 - g.l7 * ns.cos(self.beta)
@@ -153,10 +153,10 @@ class InverseSolutions:
     """All solutions of the inverse kinematics, one slot per :data:`WORKING_MODES` entry.
 
     Attributes:
-        theta: (..., 16, 3) rad, NaN where not real. theta_1 and theta_3 are in (-pi, pi], theta_2
-            is in [0, 2 pi). So each angle jumps where its arm points level towards the centre,
-            and no posture of practical use is near a jump.
-        beta: (..., 16) rad, in (-pi, pi]; NaN where not real.
+        theta: (..., 16, 3) rad; NaN where the branch is not real. theta_1 and theta_3 are in
+            (-pi, pi], theta_2 is in [0, 2 pi). So each angle jumps where its arm points level
+            towards the centre. No posture of practical use is near a jump.
+        beta: (..., 16) rad, in (-pi, pi]; NaN where the branch is not real.
         valid: (..., 16) bool, whether the branch is real.
     """
 

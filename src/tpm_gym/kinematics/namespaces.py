@@ -1,7 +1,8 @@
 """Elementwise functions of numpy arrays and torch tensors, for the equations.
 
-:mod:`tpm_gym.kinematics.equations` is written once, over a :class:`Namespace`. Tensors serve
-gradients and GPUs. :mod:`tpm_gym.kinematics.compiled` has the same functions for compiled code.
+The functions of :mod:`tpm_gym.kinematics.equations` call the functions of a :class:`Namespace`, so
+that they work with arrays and with tensors. Tensors have gradients and work on GPUs.
+:mod:`tpm_gym.kinematics.compiled` is the namespace for compiled code.
 """
 
 import math
@@ -15,7 +16,7 @@ import numpy as np
 from tpm_gym.arrays import FloatArray, is_tensor
 
 Numbers = Any
-"""A float, an array (...,) or a tensor (...,), as the functions of a namespace take them."""
+"""A float, an array (...,) or a tensor (...,): an argument of a namespace's functions."""
 _One = Callable[[Any], Any]
 _TURN = 2 * math.pi
 _BLOCK = 4096  # rows computed at a time, so that intermediate results stay in the cache
@@ -23,7 +24,7 @@ _BLOCK = 4096  # rows computed at a time, so that intermediate results stay in t
 
 @dataclass(frozen=True)
 class Namespace:
-    """Functions of one kind of numbers, elementwise.
+    """Elementwise functions of one kind of numbers.
 
     Attributes:
         root: Square root; 0 for negative numbers.
@@ -31,11 +32,11 @@ class Namespace:
         arccos: Arccosine of the clipped number.
         arcsin: Arcsine of the clipped number.
         cos_third: Cosine of a third of the arccosine of the clipped number.
-        positive: Convert an angle in [-pi, pi] to [0, 2 pi).
-        signs: Return -1 and 1 in a given shape, with the type of a given number.
-        stack: Join components (...,) along a new last axis.
-        join: Broadcast points (..., 3), and join them along their last axis.
-        solve: Solve linear systems (..., k, k) for right sides (..., k).
+        positive: Angle in [0, 2 pi) from an angle in [-pi, pi].
+        signs: The two numbers -1 and 1, in a given shape, with the type of a given number.
+        stack: Components (...,) joined along a new last axis.
+        join: Points (..., 3) broadcast with each other, and joined along their last axis.
+        solve: Solutions of linear systems (..., k, k) for right sides (..., k).
     """
 
     cos: _One
@@ -89,7 +90,8 @@ NUMPY = Namespace(
 def _torch() -> Namespace:
     """Return the namespace for tensors.
 
-    Infinite derivatives are set to 0; otherwise, derivatives of other branches would be NaN.
+    Infinite derivatives are set to 0. Otherwise, an infinite derivative in one branch of the
+    kinematics would make the derivatives of the other branches NaN, as PyTorch multiplies it by 0.
     """
     import torch  # here, since torch is optional
 

@@ -1,12 +1,12 @@
-"""Forward and inverse kinematics of points and batches, on all branches or on a named one.
+"""Forward and inverse kinematics of points and batches, on all branches or on a named branch.
 
-Frames are the paper's; units are m and rad. Branches are named and ordered in
-:mod:`tpm_gym.kinematics.modes`. Torch tensors give tensors, on their device and in float64, that
-can be differentiated. Where branches merge, the derivative is 0 instead of infinite.
+Positions are in the paper's frame; units are m and rad. :mod:`tpm_gym.kinematics.modes` names and
+orders the branches. Torch tensors give tensors on the same device, in float64, which can be
+differentiated. Where branches merge, the derivative is 0 instead of infinite.
 
 All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions on all
 branches return invalid branches for entries that are not finite. Functions on one branch raise
-InputError for them, and UnreachableError if the branch does not exist for some entry.
+InputError for such entries, and UnreachableError if the branch does not exist for some entry.
 """
 
 import math
@@ -34,8 +34,9 @@ from tpm_gym.kinematics.namespaces import Namespace, by_rows
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
     """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
 
-    A branch keeps its slot as theta moves. It is NaN where it is not real; only z is a number
-    where beta is free. For assemblies with link 3' turned, see :func:`.rotated.forward_rotated`.
+    A branch keeps its slot as theta changes. Its results are NaN where the branch is not real; but
+    where the mechanism closes for every beta, z is not NaN. For assemblies with link 3' turned, see
+    :func:`.rotated.forward_rotated`.
     """
     require_geometry(geometry)
     angles = points("theta", theta)
@@ -56,7 +57,7 @@ def forward(
 ) -> FloatArray:
     """Compute the position of P (..., 3) m at theta (..., 3) rad, on one named branch.
 
-    The default branch gives y > 0; ``AssemblyMode(-1, -1)`` gives its mirror image.
+    The default branch gives y > 0; ``AssemblyMode(-1, -1)`` gives the mirror image at y < 0.
     """
     return assembled(theta, branch, geometry).position[..., branch.index, :]
 

@@ -2,12 +2,12 @@
 
 Seen along y, leg 1 is a four-bar linkage with opposite sides of equal length: rods 4a and 4b, and
 links 3 and 3'. In the paper's mode it is a parallelogram, in which link 3' only translates. In the
-second mode it is an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y, halves
+second mode it is an antiparallelogram, in which link 3' is turned. Then B1C1, seen along y, bisects
 the angle between links 3 and 3'. Leg 2 lets link 3' turn about y, and leg 3 lets the platform turn
-with it.
+with link 3'.
 
-Both modes meet at the constraint singularity, z_C1 = z_B1. There all four sides of the linkage,
-seen along y, lie on one line, and the linkage can move on in either mode.
+The two modes meet at the constraint singularity, z_C1 = z_B1. There, all four sides of the linkage,
+seen along y, lie on one line, and the linkage can continue in either mode.
 
 Everything is in the paper's frame, in m and rad, and in numpy arrays. The tilt phi is a
 right-handed turn about y: link 3' points along (cos phi, 0, -sin phi). A vector seen along y is
@@ -41,7 +41,7 @@ _CLOSED = 1e-13  # largest rounding error of a closure |rod|^2 - l4^2, in l4^2
 
 @dataclass(frozen=True)
 class RotatedPostures:
-    """Postures with link 3' turned, of any shape (...,); NaN where there is none.
+    """Postures (...,) with link 3' turned; NaN where there is no posture.
 
     Attributes:
         theta: (..., 3) rad, the actuated angles.
@@ -131,9 +131,9 @@ def forward_rotated(theta: ArrayLike, geometry: Geometry = PAPER) -> RotatedPost
 def inverse_rotated(position: ArrayLike, geometry: Geometry = PAPER) -> RotatedPostures:
     """Compute the postures (..., 48) with link 3' turned and P at position (..., 3) m.
 
-    Slots are ordered by the sign of cos(beta), then by the tilt (6, ascending), then by the sign of
-    B_iC_i . dB_i/dtheta_i of leg 2, then of leg 3; -1 comes before 1. Positions that are not finite
-    have no posture.
+    Slots are ordered by the sign of cos(beta), then by the tilt (6 values, ascending), then by the
+    sign of B_2C_2 . dB_2/dtheta_2, then by the sign of B_3C_3 . dB_3/dtheta_3; -1 comes before 1.
+    Positions that are not finite have no posture.
 
     Raises:
         InputError: If position is no array (..., 3) of numbers.
@@ -207,10 +207,11 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     ``theta`` is (..., 3) rad. Missing solutions are NaN. There is a slot for each pair of signs
     (planar, further) of :data:`.modes.ROTATED_MODES`.
 
-    Seen along y, the vector from B1 to C1 is rho n with n = exp(-i phi / 2), since it halves the
+    Seen along y, the vector from B1 to C1 is rho n with n = exp(-i phi / 2), since it bisects the
     angle between links 3 and 3'. Then rods 4a and 4b have the same closure, which gives rho^2. With
-    this rho^2, the closure of rod 6 is 2 rho p = q. Its square, 4 rho^2 p^2 = q^2, is a
-    trigonometric polynomial of degree 2 in phi, a quartic in tan(phi / 2).
+    this rho^2, the closure of rod 6 has the form 2 rho p = q, where p and q depend on phi only. The
+    squared equation, 4 rho^2 p^2 = q^2, is a trigonometric polynomial of degree 2 in phi, a quartic
+    in tan(phi / 2).
     """
     g = geometry
     b1, b2, _ = np.moveaxis(_elbows(theta, g), -2, 0)
@@ -250,10 +251,11 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
     """Solve for theta_1 and tilt, (..., 6), given P, and P - C1 in the frame of link 3'.
 
-    Both vectors, ``p`` and ``link7``, are seen along y. For a tilt phi, ``terms`` returns the value
-    ``up`` of l3 sin(theta_1) for which B1C1 halves the angle between links 3 and 3', and the value
-    ``out`` of l3 cos(theta_1) for which rods 4 have their length. So up^2 + out^2 = l3^2 gives phi.
-    Multiplied by cos^2(phi / 2), this equation is a trigonometric polynomial of degree 3.
+    Both vectors, ``p`` and ``link7``, are seen along y. The inner function ``terms`` returns two
+    values for a tilt phi: ``up`` is the l3 sin(theta_1) for which B1C1 bisects the angle between
+    links 3 and 3', and ``out`` is the l3 cos(theta_1) for which rods 4 have their length. So the
+    equation up^2 + out^2 = l3^2 gives phi. Multiplied by cos^2(phi / 2), this equation is a
+    trigonometric polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 
@@ -293,7 +295,7 @@ def _refined(
     one: FloatArray,
     two: FloatArray,
 ) -> tuple[_Pair, _Pair, _Four]:
-    """Refine two unknowns by Newton's method; return them, the closures and their derivatives."""
+    """Refine two unknowns by Newton's method; return unknowns, closures, closures' derivatives."""
     for _ in range(_STEPS):
         (e, f), (a, b, c, d) = closures(one, two)
         determinant = a * d - b * c
@@ -304,13 +306,16 @@ def _refined(
 
 
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
-    """Sort solutions into slots: the half with the smaller ``sign`` first, then by the tilt."""
+    """Sort solutions into four slots; slots without a solution are NaN.
+
+    The half with the smaller ``sign`` gets the first two slots, the other half the last two. In
+    each half, the tilts in [0, 2 pi) are ascending.
+    """
     real = ~np.isnan(sign)
     count = real.sum(axis=-1, keepdims=True)
     half = count // 2
     positive = sign.argsort(axis=-1).argsort(axis=-1) >= half
     order = np.lexsort((np.mod(tilt, 2 * np.pi), positive, ~real), axis=-1)
-    # Half go to the first two slots, the others to the last two.
     place = np.concatenate([0 * half, 0 * half + 1, half, half + 1], axis=-1)
     filled = place < np.concatenate([half, half, count, count], axis=-1)
     source = np.take_along_axis(order, np.minimum(place, 3), axis=-1)
@@ -321,7 +326,7 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """Compute cos(beta), and whether rod 11 closes: Eqs. (9), (10) in the frame of link 3'."""
+    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'; find if rod 11 fits."""
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)
     u, w = to_c1.real + 2 * g.l2, to_c1.imag + g.l6
@@ -341,7 +346,7 @@ def factors(postures: RotatedPostures) -> Factors:
       and 6, seen along y, meet in one point.
     * leg1, m^2/rad, zero where motor 1 can turn while P rests and link 3' turns about P.
     * leg2 and leg3 = B_iC_i . dB_i/dtheta_i, m^2/rad.
-    * elevation = z_C1 - z_B1 = -rho sin(phi / 2), m, zero where both operation modes meet; see
+    * elevation = z_C1 - z_B1 = -rho sin(phi / 2), m, zero where the two operation modes meet; see
       :func:`link3_rotated`.
     """
     g = postures.geometry
@@ -365,10 +370,10 @@ def factors(postures: RotatedPostures) -> Factors:
 
 @np.errstate(all="ignore")
 def velocity(postures: RotatedPostures) -> FloatArray:
-    """Compute rates of P (m/rad) and of the tilt (rad/rad) per rate of each motor, (..., 4, 3).
+    """Compute rates of P (m/rad) and the tilt (rad/rad) for unit rates of the motors, (..., 4, 3).
 
     The rates keep the lengths of all rods. Rods 4a, 4b and 6 give the velocity and the turn of link
-    3', and rod 11 gives the rate of link 7. At a parallel singularity, and where both operation
+    3', and rod 11 gives the rate of link 7. At a parallel singularity, and where the two operation
     modes meet, the rates are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends

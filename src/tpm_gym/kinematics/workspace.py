@@ -1,6 +1,6 @@
-"""Regions, and reachability, assembly modes and conditioning of points.
+"""Regions; and the reachability, assembly modes and conditioning of points.
 
-Everything here is in the paper frame, in metres, on one working mode.
+All points are in the paper frame, in metres. Each function considers one working mode.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,8 @@ class Region:
         high: Largest x, y, z, m.
 
     Raises:
-        ConfigurationError: If they are not three finite numbers each, or low exceeds high.
+        ConfigurationError: If ``low`` or ``high`` is not three finite numbers, or ``low`` exceeds
+            ``high``.
     """
 
     low: Vector

@@ -1,7 +1,7 @@
 """Training of policies: hindsight, features, demonstrations, recipes.
 
-Needs the extra ``train``. Importing this package imports neither PyTorch nor Stable-Baselines3. A
-name is imported when it is first used.
+This package needs the extra ``train``. Importing the package imports neither PyTorch nor
+Stable-Baselines3. A name is imported when it is first used.
 """
 
 import importlib

@@ -1,8 +1,8 @@
 """Algorithms of Stable-Baselines3, and the entries of their recipes.
 
 A row of ``ALGORITHMS`` and a file ``train/recipes/<name>.yml`` are enough to train, resume,
-evaluate and export with another algorithm. If it has an argument that is not in ``_ENTRIES`` yet,
-add a row there.
+evaluate and export with another algorithm. If the algorithm has an argument that is not in
+``_ENTRIES`` yet, add a row there.
 """
 
 from __future__ import annotations
@@ -95,12 +95,16 @@ class Algorithm:
         return found
 
     def argument(self, given: Mapping[str, Any], name: str) -> Any:
-        """Return an argument of the constructor, given or default; None if there is no such one."""
+        """Return a constructor's argument, given or default; None if there is no such argument."""
         parameters = inspect.signature(self.load_class()).parameters
         return given.get(name, parameters[name].default if name in parameters else None)
 
     def entries(self) -> Any:
-        """Return the type of a recipe: its keys are arguments of the algorithm and its policy."""
+        """Return the type of the algorithm's recipes, a TypedDict.
+
+        Keys are ``n_timesteps``, ``n_envs``, ``demonstrations``, and arguments of the algorithm's
+        constructor. The key ``policy_kwargs`` has the arguments of the policy.
+        """
         kind: Any = self.load_class()
         arguments = inspect.signature(kind).parameters
         policy = inspect.signature(kind.policy_aliases["MultiInputPolicy"]).parameters

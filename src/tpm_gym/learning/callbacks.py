@@ -29,11 +29,12 @@ _LARGEST_SHARE: Final = 0.02  # largest fraction of the time for writing checkpo
 class PeriodicEvaluation(BaseCallback):
     """Evaluation of the policy on held-out seeds before, during and after training.
 
-    All evaluations use the same episodes. Each is appended to evaluations.jsonl, with the training
-    time so far in seconds: wall-clock time, and CPU time of the main process (without workers).
+    All evaluations use the same episodes. Each evaluation is appended to evaluations.jsonl, with
+    the training time so far in seconds: wall-clock time, and CPU time of the main process (without
+    workers).
 
-    ``envs`` are separate, so that evaluations do not disturb training. ``keep`` is called with the
-    model whenever it is the best so far.
+    ``envs`` are not those of the training, so evaluations do not disturb it. ``keep`` is called
+    with the model whenever the model is the best so far.
     """
 
     config: TrainingConfig
@@ -105,7 +106,7 @@ def quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
 
 
 class ProgressBar(BaseCallback):
-    """Progress bar on a terminal; nothing elsewhere."""
+    """Progress bar, which is shown on a terminal only."""
 
     def __init__(self, console: Console) -> None:
         """Lay out the bar without showing it."""
@@ -129,7 +130,7 @@ class ProgressBar(BaseCallback):
 
 
 class StopTrainingError(Exception):
-    """Exit from ``learn`` after the last checkpoint; users never see it."""
+    """Error that ends ``learn`` after the last checkpoint; it is caught, so users never see it."""
 
 
 @dataclass(eq=False)
@@ -137,8 +138,8 @@ class Checkpointing(BaseCallback):
     """Checkpoints between rollouts, and one when the process is asked to stop.
 
     If a checkpoint cannot be written, a warning is printed, and training continues until the next
-    checkpoint is due. The first checkpoint is saved before the first policy, so that a run with a
-    saved policy has a checkpoint. ``seconds`` is the training time in earlier processes, s.
+    checkpoint is due. The first checkpoint is saved before any policy is saved, so that every run
+    with a saved policy has a checkpoint. ``seconds`` is the training time in earlier processes, s.
     """
 
     config: TrainingConfig

@@ -42,7 +42,7 @@ class Content:
 
 @dataclass
 class CheckpointStore:
-    """Checkpoints of one run, in a folder that is made when the first is saved."""
+    """Checkpoints of one run, in a folder that is made when the first checkpoint is saved."""
 
     folder: Path
     _whole: list[int] = field(default_factory=list, init=False)  # steps kept, oldest first

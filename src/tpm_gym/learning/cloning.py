@@ -12,10 +12,10 @@ from torch.nn import functional
 _RATE: Final = 1e-3
 _BATCH: Final = 256
 _BETA: Final = 0.1
-"""Error of an action above which the loss is linear; below, it is quadratic.
+"""Limit of an action's error: above it the loss is linear, below it quadratic.
 
 In similar states, for example where the expert's path turns, the expert takes two different
-actions. A squared loss would teach their mean, which is neither of them.
+actions. A squared loss would teach the mean of the two actions, which is neither of them.
 """
 _VALUE_EPOCHS: Final = 3
 
@@ -64,7 +64,10 @@ def _tensor(values: NDArray[Any], model: OnPolicyAlgorithm) -> torch.Tensor:
 def _fit(
     policy: torch.nn.Module, loss: Callable[[torch.Tensor], torch.Tensor], count: int, epochs: int
 ) -> None:
-    """Minimise the loss of rows by Adam, with a learning rate that falls to zero."""
+    """Minimise a loss over ``count`` recorded steps with Adam; the learning rate falls to zero.
+
+    ``loss`` gets the indices of a batch of steps.
+    """
     optimiser = torch.optim.Adam(policy.parameters(), lr=_RATE)
     for epoch in range(epochs):
         batches = torch.split(torch.randperm(count), _BATCH)

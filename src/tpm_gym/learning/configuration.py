@@ -76,15 +76,16 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment; an option that is not given keeps the id's value."""
+    """Options of an environment; "the id's" below means the default of the environment id."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
-    """Robot: paper, wide, delta, or your module's."""
+    """Robot: paper, wide, delta, or one that your module registers."""
 
     engine: Annotated[str, unset(str, "the id's, mostly pybullet; collect: analytic", "NAME")] = (
         UNSET
     )
-    """Engine: pybullet, mujoco, analytic (many environments at once), or your module's."""
+    """Engine: pybullet, mujoco, analytic (many environments at once), or one that your module
+    registers."""
 
     drive: Annotated[
         str,
@@ -93,7 +94,7 @@ class EnvOptions:
     """Motors: ideal ones follow commands exactly up to their peak torque; servo drives lag."""
 
     shield: Annotated[bool | float | None, _SHIELD, _SHIELD_HINT] = UNSET
-    """Replace actions by the nearest ones that keep clear of singularities."""
+    """Replace actions by the nearest actions that keep clear of singularities."""
 
     @property
     def in_batches(self) -> bool:
@@ -127,16 +128,16 @@ class TrainingConfig:
     """Seed of everything random."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Steps in all environments together."""
+    """Number of steps, in all environments together."""
 
     envs: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Environments. Each has its own process; in --engine analytic they share one."""
+    """Number of environments. Each has its own process; with --engine analytic, they share one."""
 
     recipe_file: Annotated[Path, unset(Path, "the shipped one of <algo>", "PATH", "recipe")] = UNSET
     """YAML file of hyperparameters."""
 
     recipe: tyro.conf.Suppress[Annotated[Recipe, unset(type(None), "", "")]] = UNSET
-    """Hyperparameters in that file."""
+    """Hyperparameters in ``recipe_file``."""
 
     demonstrations: Annotated[int | None, unset(int, "as the recipe says", "INT")] = None
     """Number of the expert's episodes to learn from at the start, rounded up to a multiple of
@@ -166,14 +167,14 @@ class TrainingConfig:
 
     test_episodes: int = 100
     """Episodes of the final test in each engine; 0 for no test. Only a training in --engine
-    analytic ends with a test: of the best policy, in that engine and in PyBullet."""
+    analytic ends with a test, which runs the best policy in that engine and in PyBullet."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
-    """Steps between checkpoints. By time: every 30 s, or less often, so that saving takes at most
-    2% of the time."""
+    """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so
+    that saving takes at most 2% of the time."""
 
     threads: int = 1
-    """Threads of PyTorch. With one, small networks are fastest, and results repeat exactly."""
+    """PyTorch threads. With one thread, small networks are fastest, and results repeat exactly."""
 
     device: str = "cpu"
     """Device of PyTorch, such as cpu or cuda."""
@@ -237,10 +238,11 @@ class ResumeConfig:
     """Folder of the run."""
 
     env: Annotated[str, unset(str, "the run's", "MODULE:ID")] = UNSET
-    """Id of the run. Needed if it is module:id: importing a module runs its code."""
+    """Environment id of the run. It must be given if it is module:id, because importing a module
+    runs its code."""
 
     steps: Annotated[int, unset(int, "the run's", "INT")] = UNSET
-    """Steps in all, those already taken included."""
+    """Total number of steps, including the steps that are already taken."""
 
     eval_every: Annotated[int, unset(int, "the run's", "INT")] = UNSET
     """Steps between evaluations."""
@@ -256,7 +258,7 @@ class ResumeConfig:
 
 
 def complete(config: TrainingConfig) -> TrainingConfig:
-    """Compute the options that are not given, and check all."""
+    """Compute the options that are not given, and check all options."""
     import_module_of(config.env)
     check_env_id(config.env)
     _check_numbers(config)
@@ -350,7 +352,7 @@ def _check(config: TrainingConfig) -> None:
 
 
 def _check_numbers(config: TrainingConfig) -> None:
-    """Check the numbers that are given, as far as no recipe is needed."""
+    """Check the given numbers; make only the checks that need no recipe."""
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
     check_least(config, 0, "test_episodes", "demonstrations")

@@ -60,7 +60,8 @@ Advance = Callable[[int], object]
 Kind = Literal["expert", "noisy", "random", "replay"]
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 REFERENCE: Final = 100
-"""Episodes of the reference scores."""
+"""Number of episodes for each of the two reference scores of a dataset. These scores are the mean
+returns of random actions and of the expert."""
 
 _INFOS: Final = ("conditioning", "is_success", "singularity_penalty")
 _DATA: Final = "data"  # name that Minari expects
@@ -89,16 +90,16 @@ class CollectConfig:
     """Seed of the first episode, and of the training of kind replay."""
 
     noise: float = 0.3
-    """Standard deviation of the noise of kind noisy, in units of the largest action."""
+    """Standard deviation of the noise in kind noisy, in units of the largest action."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
     """Steps of the training of kind replay."""
 
     out: Annotated[Path, unset(Path, "Minari's", "FOLDER")] = UNSET
-    """Folder of the datasets. Minari's is $MINARI_DATASETS_PATH, or ~/.minari/datasets."""
+    """Folder of the datasets. Minari's folder is $MINARI_DATASETS_PATH, or ~/.minari/datasets."""
 
     overwrite: bool = False
-    """Replace datasets of this command that are there already."""
+    """Replace datasets that this command wrote earlier."""
 
     env_options: GivenEnvOptions = field(default_factory=lambda: EnvOptions(engine="analytic"))
 
@@ -274,7 +275,7 @@ def _split(steps: Sequence[Step], first_seed: int, count: int) -> Iterator[Episo
 
 
 def _require_free(dataset: Dataset) -> None:
-    """Refuse a folder that is there, unless it holds a dataset of ours that may be replaced."""
+    """Refuse a folder that exists, unless it holds a dataset of tpm_gym that may be replaced."""
     if not dataset.folder.exists():
         provenance.require_writable("--out", dataset.folder)
         return
@@ -341,7 +342,7 @@ def digest(data: Path, episodes: int | None = None) -> str:
 
     Args:
         data: Folder ``data`` of the dataset.
-        episodes: Number of episodes from the first on; None for all.
+        episodes: Number of episodes to include, starting with the first; None for all.
     """
     from minari.dataset.minari_storage import MinariStorage
 

@@ -56,9 +56,10 @@ class Demonstrations(BaseCallback):
         """Set the number of episodes and the noise.
 
         Args:
-            episodes: Rounded up to a multiple of the number of environments.
-            noise: Standard deviation, in units of the largest action.
-            epochs: Passes over the episodes when an on-policy algorithm is fitted to them.
+            episodes: Number of episodes, rounded up to a multiple of the number of environments.
+            noise: Standard deviation of the noise, in units of the largest action.
+            epochs: Number of passes over the episodes when an on-policy algorithm is fitted to
+                them.
         """
         super().__init__(verbose)
         self.episodes, self.noise, self.epochs = episodes, noise, epochs

@@ -39,7 +39,10 @@ def import_module_of(env_id: str) -> None:
 
 
 def check_env_id(env_id: str) -> EnvSpec:
-    """Return the registration of an id of ours; a module of ``module:id`` is not imported."""
+    """Return the registration of an environment id; refuse ids of other packages.
+
+    The module of ``module:id`` is not imported.
+    """
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
         raise ConfigError(
@@ -76,7 +79,8 @@ def make_env(env: str | EnvSpec, *, in_worker: bool = False, **options: Any) -> 
     """Make an environment, with arguments such as ``goals`` and ``penalty_weight``.
 
     Args:
-        env: An id, or its registration, which another process may not have.
+        env: An id, or the registration of an id. A registration also works in a process where the
+            id is not registered.
         in_worker: Whether this is a worker process. Ctrl-C reaches all processes of a terminal. A
             worker ignores it, so that the main process can still save.
     """

@@ -58,13 +58,15 @@ class EvaluationConfig:
     """expert, random, the id of a published policy, an exported policy or the folder of a run."""
 
     env: Annotated[str, unset(str, "the policy's, unless that is module:id", "ID")] = UNSET
-    """Environment id, or module:id if a module of yours registers it."""
+    """Environment id, or module:id if a module of yours registers it. It must be given if the
+    policy was trained in module:id, because importing a module runs its code."""
 
     episodes: int = 100
     """Episodes of each policy."""
 
     seed: int = TEST_SEED
-    """Seed of the first episode. Training and selection use seeds below the default."""
+    """Seed of the first episode. Training, and the choice of the best policy, use seeds below the
+    default seed."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
     """Goals: sampled everywhere, or only next to the singularity (tempting)."""
@@ -126,7 +128,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
 
     Raises:
         LearningError: An option is not valid, or a policy cannot be used.
-        ConfigurationError: The environment has no such option, or not with this value.
+        ConfigurationError: The environment does not have an option, or refuses its value.
     """
     # Output to a file has no margin at which a table must be folded.
     console = console or Console(width=None if sys.stdout.isatty() else 200)
@@ -279,7 +281,7 @@ def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[st
 
 
 def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:
-    """Return one path per policy; several file names contain the names of their policies."""
+    """Return one path per policy; if there are several, file names contain the policies' names."""
     if len(policies) == 1:
         return [path]
     names = [Path(spec).stem for spec in policies]

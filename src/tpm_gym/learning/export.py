@@ -30,7 +30,7 @@ from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-4
-"""Largest error of an exported action, relative to half its range or to 1, whichever is larger.
+"""Largest error of an exported action, divided by the larger of 1 and half the action's range.
 
 Single precision rounds the actions of networks with large weights by 1e-5. Wrong weights or a wrong
 activation cause far larger errors.
@@ -60,16 +60,18 @@ def save(
     env_options: Mapping[str, Any] | None = None,
     versions: Mapping[str, str | None] | None = None,
 ) -> Path:
-    """Write the policy of a model as ``path``.safetensors and ``path``.json; return the latter.
+    """Write the policy of a model; return the path of the JSON file.
 
-    The files get their final names only after a check that the written policy acts like the model.
+    The files are ``path``.safetensors and ``path``.json.
+
+    They get their final names only after a check that the written policy acts like the model.
     A policy that the files cannot express is therefore refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Common name of the files. An earlier policy is replaced.
-        env_options: Machine, engine, drive and shield of the training. Those left out are the
-            defaults of ``env_id``.
+        env_options: Machine, engine, drive and shield of the training. Options that are left out
+            have the defaults of ``env_id``.
         versions: Versions at training; by default the installed ones.
 
     Raises:
@@ -107,7 +109,7 @@ def save(
 
 
 def save_archive(model: BaseAlgorithm, path: Path) -> None:
-    """Save a model as an archive of Stable-Baselines3; readers never see a part of the file."""
+    """Save a model as an archive of Stable-Baselines3; no reader sees an incomplete file."""
     file = io.BytesIO()  # PyTorch itself, writing to a full disk, would hide the error
     model.save(file)
     provenance.write_whole(path, lambda part: part.write_bytes(file.getvalue()))

@@ -8,9 +8,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 class GoalGapExtractor(BaseFeaturesExtractor):
     """Features extractor that scales the distance to the goal.
 
-    Goals are in metres, and a centimetre decides about success. The features are therefore the
-    observation, whose values are of order one, and (desired - achieved) / unit. The achieved goal
-    is part of the observation already.
+    Goals are in metres, and a centimetre decides about success. So the distance to the goal is
+    divided by ``unit``. The features are the entry ``observation``, whose values are of order one,
+    followed by (desired goal - achieved goal) / unit. The entry ``observation`` contains the
+    achieved goal already.
     """
 
     def __init__(self, observation_space: spaces.Dict, unit: float = 0.05) -> None:

@@ -36,7 +36,7 @@ def write_video(path: Path, play: Play, fps: float) -> None:
 
 
 def write_contact_sheet(path: Path, play: Play, fps: float) -> None:
-    """Write a PNG of the six moments of an episode that differ most, each above its time."""
+    """Write a PNG of the six most different moments of an episode, with the time below each."""
     frames: list[Frame] = []
     play(frames.append)
     sheet = contact_sheet({f"{k / fps:.3g} s": frames[k] for k in _moments(frames)}, _COLUMNS)
@@ -44,7 +44,7 @@ def write_contact_sheet(path: Path, play: Play, fps: float) -> None:
 
 
 def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
-    """Draw equally large pictures row by row, each above its caption."""
+    """Draw equally large pictures row by row, with a caption below each picture."""
     from PIL import Image, ImageDraw, ImageFont
 
     height, width, _ = next(iter(pictures.values())).shape
@@ -62,7 +62,10 @@ def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
 
 
 def _moments(frames: list[Frame]) -> list[int]:
-    """Choose the first frame, the last, and repeatedly the one least like all chosen frames."""
+    """Return the indices of six frames that differ most.
+
+    Choose the first and the last frame, then repeatedly the frame least like all chosen frames.
+    """
     pictures = np.stack(frames)[:, ::2, ::2].astype(np.int16)
 
     def differences(index: int) -> NDArray[Any]:

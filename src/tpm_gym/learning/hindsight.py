@@ -14,10 +14,10 @@ from tpm_gym.learning.errors import ConfigError
 class PenaltyHerReplayBuffer(HerReplayBuffer):
     """Hindsight experience replay for a reward of the form ``R(achieved, goal) - penalty``.
 
-    Stable-Baselines3 relabels with ``compute_reward(achieved, new_goal, {})``. The info is empty,
-    so relabelled samples, four of five, would lose the penalty. The penalty does not depend on the
-    goal. With the stored reward r, the next achieved goal ag', the old goal g and the new goal g',
-    the reward for g' is therefore
+    Stable-Baselines3 relabels four of five samples with ``compute_reward(achieved, new_goal, {})``.
+    The info is empty, so the relabelled samples would lose the penalty. The penalty does not depend
+    on the goal. With the stored reward r, the next achieved goal ag', the old goal g and the new
+    goal g', the reward for g' is therefore
 
         r' = r - R(ag', g) + R(ag', g')
     """
@@ -53,7 +53,7 @@ class PenaltyHerReplayBuffer(HerReplayBuffer):
     def _goal_independent_reward(
         self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64]
     ) -> NDArray[np.float32]:
-        """Return r - R(ag', g) of stored transitions, which is minus the weighted penalty, (n,)."""
+        """Return r - R(ag', g) of stored transitions, (n,): the penalty with a negative sign."""
         assert self.env is not None  # as in the parent
         achieved = self.next_observations["achieved_goal"][batch_indices, env_indices]  # (n, 3) m
         desired = self.next_observations["desired_goal"][batch_indices, env_indices]  # (n, 3) m

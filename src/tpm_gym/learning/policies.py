@@ -52,8 +52,8 @@ class RandomPolicy:
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
         """Seed a generator for each episode with the episode's seed and a constant.
 
-        The environment draws its goal from a generator that has the seed alone. Actions from an
-        equal generator would depend on the goal.
+        The environment draws its goal from a generator that is seeded with the episode's seed only.
+        Actions from a generator with this seed would depend on the goal.
         """
         self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
 
@@ -81,7 +81,7 @@ class NoisyPolicy:
     rngs: list[np.random.Generator] = field(default_factory=list)
 
     def reset(self, observation: Observation, seeds: Sequence[int]) -> None:
-        """Reset the policy, and seed a generator for each episode, as :class:`RandomPolicy`."""
+        """Reset the policy; seed a generator for each episode as :class:`RandomPolicy` does."""
         self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
         self.policy.reset(observation, seeds)
 
@@ -99,7 +99,7 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
 
     Args:
         spec: ``expert``, ``random``, an exported policy (either of its files, or their common
-            name), the id of a published one, or the folder of a run (its best policy).
+            name), the id of a published policy, or the folder of a run (its best policy).
 
     Raises:
         PolicyError: There is no such policy, its files are damaged, or it does not fit ``envs``.
@@ -117,7 +117,7 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
 
 
 def trained_in(spec: str) -> tuple[str, dict[str, Any]] | None:
-    """Return the environment id and its options that a policy was trained with, if any."""
+    """Return environment id and options of a policy's training; None for expert and random."""
     if spec in SCRIPTED:
         return None
     about = _exported(spec).description

@@ -80,7 +80,7 @@ def machine() -> dict[str, Any]:
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return a command that repeats this process, without folders outside the working directory."""
+    """Return a command that repeats this process; see :func:`_portable` for the paths in it."""
     program, *words = sys.argv if arguments is None else arguments
     # ``python -m tpm_gym.learning`` is the same command.
     ours = Path(program).name == "tpm-gym" or Path(program) == Path(__file__).parent / "__main__.py"
@@ -99,14 +99,18 @@ def _portable(word: str) -> str:
 
 
 def require_packages(extras: Mapping[str, str]) -> None:
-    """Raise MissingPackageError if a package is missing; ``extras`` maps packages to extras."""
+    """Raise MissingPackageError if a package is missing.
+
+    Args:
+        extras: For each required package, the extra of tpm_gym that installs it.
+    """
     for package, extra in extras.items():
         if find_spec(package) is None:
             raise MissingPackageError(package, extra)
 
 
 def require_writable(option: str, path: Path) -> None:
-    """Make the folder of a file that will be written later, and check that it can be written."""
+    """Make the folder of a file that will be written later; check that the file can be written."""
     problem = None
     try:
         if path.is_dir():
@@ -144,10 +148,10 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file under a temporary name and rename it, so that readers never see a part of it.
+    """Write a file under a temporary name and rename it, so that no reader sees an incomplete file.
 
-    Missing parent folders are made. A link stays, and its target is replaced. ``write`` gets a path
-    with the same suffix.
+    Missing parent folders are made. If ``path`` is a link, the link stays, and its target is
+    replaced. ``write`` is called with the temporary path, which has the same suffix.
     """
     target = _target(path)
     target.parent.mkdir(parents=True, exist_ok=True)

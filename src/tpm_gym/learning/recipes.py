@@ -5,7 +5,7 @@ arguments of the algorithm's constructor, plus ``n_timesteps``, ``n_envs``, ``po
 ``demonstrations``: episodes of the expert from which the policy learns before training starts.
 Values are plain YAML, and nothing is evaluated. Where the zoo evaluates a string such as
 ``"dict(net_arch=[64, 64])"``, a recipe here has a mapping, which the zoo reads too. A file for
-several algorithms has the recipes of each one under its name: ``ppo``, ``sac``, ``tqc``.
+several algorithms has the recipes of each algorithm under its name: ``ppo``, ``sac``, ``tqc``.
 """
 
 import re
@@ -58,12 +58,12 @@ class Recipe:
         return {**found, **self.arguments}
 
     def keywords(self, update: float = 0.0) -> dict[str, Any]:
-        """Return keyword arguments of the algorithm's constructor, with classes for names.
+        """Return keyword arguments of the constructor, with classes in place of their names.
 
         Args:
             update: Steps between two updates, as a fraction of all steps. A falling learning rate
                 ends at this fraction of its first value, in the last update. With ``update=0``, as
-                in Stable-Baselines3, it ends at zero, and the last update changes nothing.
+                in Stable-Baselines3, the rate ends at zero, and the last update changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):
@@ -75,7 +75,13 @@ class Recipe:
 
 
 def _falling(start: float, update: float, remaining: float) -> float:
-    """Return the learning rate of an update; ``remaining`` is the share of steps after it."""
+    """Return the learning rate of an update.
+
+    Args:
+        start: Learning rate at the start of the training.
+        update: Steps between two updates, as a fraction of all steps.
+        remaining: Steps after this update, as a fraction of all steps.
+    """
     return start * max(0.0, min(1.0, remaining + update))
 
 
@@ -99,7 +105,7 @@ def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> di
 
 
 def recipe_file(algorithm: str, engine: str | None = None) -> Path:
-    """Return the file of an algorithm's shipped recipes, for an engine if there is such a file."""
+    """Return the file of an algorithm's shipped recipes; an engine may have its own file."""
     if algorithm not in ALGORITHMS:
         raise ConfigError(f"algorithm {algorithm!r} is none of {NAMES}")
     own = RECIPES / f"{algorithm}-{engine}.yml"
@@ -154,7 +160,7 @@ def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
 def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
     """Read the recipe of an environment, ``id`` or ``module:id``, after checking the whole file.
 
-    An id without a recipe gets the recipe of pick-and-place without demonstrations.
+    An id without a recipe gets the recipe of pick-and-place, but without the demonstrations.
     """
     recipes = read_recipes(path, algorithm)
     module, _, name = env_id.rpartition(":")

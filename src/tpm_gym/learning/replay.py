@@ -1,8 +1,8 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
-The algorithm is that of ``tpm-gym train`` without ``--algo``. The policy acts as in training, with
-its exploration. Episodes are spread evenly over the steps of the training after its demonstrations.
-They have seeds of their own and do not affect the training.
+The algorithm is the one that ``tpm-gym train`` uses without ``--algo``. The policy acts as in
+training, with its exploration. Episodes are spread evenly over the steps of the training after its
+demonstrations. The episodes have seeds of their own and do not affect the training.
 """
 
 from collections.abc import Callable, Iterator
@@ -60,7 +60,7 @@ class _Moments(BaseCallback):
 def episodes(
     env: str, options: EnvOptions, seed: int, count: int, steps: int, record: Record
 ) -> list[Any]:
-    """Train, and return ``count`` episodes that ``record`` made.
+    """Train a policy, play episodes with it at several moments of the training, and return them.
 
     Args:
         env: Id, or ``module:id``.
@@ -68,7 +68,8 @@ def episodes(
         count: Number of episodes, spread evenly over the moments.
         seed: Seed of the training, and of the first episode.
         steps: Steps of the training; UNSET for the recipe's number.
-        record: Called with environments, policy, number of episodes and first seed.
+        record: Function that plays the episodes of a moment. Its arguments are environments,
+            policy, number of episodes and first seed.
     """
     config = complete(TrainingConfig(env=env, seed=seed, steps=steps, env_options=options))
     torch.set_num_threads(config.threads)

@@ -53,7 +53,7 @@ class Episode:
         closure_error_max: Largest loop gap of all steps, m.
         unsafe_share: Share of the steps below the machine's safe conditioning.
         fk_error_max: Largest distance of the observed point P (forward kinematics of the encoders)
-            from the simulated one, m.
+            from the simulated point P, m.
         torque_rms: Root mean square of the motors' torques at the ends of the steps, N m.
         torque_peak: Largest of these torques, N m.
         events: For each event of the task, as in ``{"crossed_once": True}``, whether the info of
@@ -145,8 +145,8 @@ def run_episodes(
     """Run a policy for a number of episodes; equal arguments give equal records.
 
     Args:
-        envs: Environments with next-step autoreset. Each plays one episode at a time. They are
-            not closed.
+        envs: Environments with next-step autoreset. Each environment plays one episode at a time.
+            The environments are not closed.
         first_seed: Episode i is reset with ``first_seed + i``.
         on_frame: Called after every reset and every step, for example to record a video.
         on_episodes: Called with the number of episodes that have just ended, as for a progress bar.

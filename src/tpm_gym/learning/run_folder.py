@@ -52,11 +52,12 @@ _Evaluation = TypedDict(
 )
 """Entries of an evaluation that a resumed training needs."""
 RESTORED: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, *_BEST)
-"""Files that a checkpoint holds. Resuming restores them, and writes later entries again."""
+"""Files that a checkpoint holds. Resuming restores them as they were at the checkpoint. Entries
+that were written after the checkpoint are removed, and the resumed training writes them again."""
 
 
 def prepare(run: Path, overwrite: bool) -> None:
-    """Make the folder of a new run; with ``overwrite``, delete an earlier run, no other files."""
+    """Make the folder of a new run; with ``overwrite``, delete the files of an earlier run."""
     try:
         run.mkdir(parents=True, exist_ok=True)
         # A process that is killed at its start leaves a hidden, partial file.

@@ -12,8 +12,8 @@ from types import FrameType
 class SignalListener:
     """Store of the first request to stop; the second request ends the process at once.
 
-    The first is stored, not raised: an exception in the middle of an update could leave a
-    half-updated network to save.
+    The first request raises no exception: an exception in the middle of an update could leave a
+    half-updated network, which would then be saved.
     """
 
     received: signal.Signals | None = None

@@ -52,7 +52,7 @@ from tpm_gym.learning.run_folder import (
 from tpm_gym.learning.signals import SignalListener
 from tpm_gym.learning.vec_env import AnalyticVecEnv
 
-_TESTED: Final = ("analytic", "pybullet")  # engines of the last test
+_TESTED: Final = ("analytic", "pybullet")  # engines of the final test
 _CHANGEABLE: Final = {
     **dict.fromkeys(("steps", "eval_every", "checkpoint_every", "threads"), int),
     "device": str,
@@ -119,8 +119,9 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
 def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signals | None:
     """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
-    A run that was killed before its first checkpoint begins again. A finished run stays as it is,
-    unless it is given more steps; a missing learning curve or last test is made.
+    A run that was killed before its first checkpoint begins again. A finished run is continued only
+    if it is given more steps. Otherwise, only a missing learning curve is drawn, and a missing
+    final test is run.
 
     Raises:
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
@@ -173,7 +174,7 @@ def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str,
 
 @contextmanager
 def _foreign_named(run: Path) -> Iterator[None]:
-    """Convert errors of a checkpoint whose checksum is right, but whose entries are not."""
+    """Raise a CheckpointError if a checkpoint has the right checksum but wrong entries."""
     try:
         yield
     except TPMError:
@@ -200,7 +201,7 @@ class _Session:
     content: Content | None
 
     def run(self) -> signal.Signals | None:
-        """Train, save and test; return the signal that stopped the training, None without one."""
+        """Train, save and test; return the signal that stopped the training, or None."""
         config, listener = self.config, SignalListener()
         torch.set_num_threads(config.threads)
         count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
@@ -289,7 +290,7 @@ class _Session:
         export.save_archive(model, archive)
 
     def _conclude(self, stopped_by: signal.Signals | None) -> None:
-        """Report how the training ended, and test a policy of the analytic engine."""
+        """Report how the training ended; run the final test if the configuration has one."""
         config = self.config
         if stopped_by is not None:
             command, saved = run_folder.resume_command(config.run), "without a checkpoint"
@@ -302,7 +303,11 @@ class _Session:
             self._test()
 
     def complete(self) -> bool:
-        """Make curve and last test if a kill prevented them; return whether the test was made."""
+        """Draw the curve and run the final test if they are missing because the run was killed.
+
+        Returns:
+            Whether the final test ran.
+        """
         config = self.config
         if not (config.run / CURVE_FILE).exists():
             evaluations = run_folder.evaluations(config.run)
@@ -355,7 +360,10 @@ def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
 
 
 def _require_room(config: TrainingConfig, numbers: int) -> None:
-    """Refuse a buffer that does not fit in memory; a step holds two observations."""
+    """Refuse a buffer that does not fit in memory.
+
+    The size of a step is assumed to be two observations of ``numbers`` values each.
+    """
     name = "buffer_size" if config.argument("buffer_size") else "n_steps"
     size = config.argument("buffer_size") or config.rollout
     try:

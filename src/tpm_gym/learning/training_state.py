@@ -54,7 +54,7 @@ class _Episode(TypedDict):
 
 
 class _State(TypedDict):
-    """State outside PyTorch and arrays, as in the JSON file of a checkpoint."""
+    """Content of the JSON file of a checkpoint: the state except tensors and arrays."""
 
     counters: dict[str, float]
     statistics: tuple[list[_Episode], list[float]]
@@ -68,8 +68,8 @@ class _State(TypedDict):
 class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
     """Wrapper that records the seed and the actions of the unfinished episode.
 
-    PyBullet has state that cannot be read, so the episode is repeated instead. This is exact, takes
-    a tenth of a second, and also restores the wrappers below.
+    PyBullet has state that cannot be read, so the episode is repeated instead. Repeating is exact,
+    takes a tenth of a second, and also restores the wrappers inside this one.
     """
 
     def __init__(self, env: GoalEnv) -> None:
@@ -113,7 +113,8 @@ def capture(model: BaseAlgorithm, run: Path, seconds: float, finished: bool = Fa
     """Return the state of a training between two rollouts; arrays of the buffer are views.
 
     Args:
-        model: Its environments are an ``AnalyticVecEnv``, or each has an :class:`EpisodeRecorder`.
+        model: Algorithm whose environments are an ``AnalyticVecEnv``, or have an
+            :class:`EpisodeRecorder` each.
         seconds: Training time so far, s.
     """
     envs: Any = model.env
@@ -160,7 +161,7 @@ def restore(model: BaseAlgorithm, content: Content) -> float:
     """Restore a training in a new algorithm, built with equal arguments.
 
     Returns:
-        The ``seconds`` of :func:`capture`.
+        Training time until the checkpoint, s.
     """
     state = json.loads(content.files[STATE])
     TypeAdapter(_State).validate_python(state)
@@ -250,7 +251,7 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Restore the unfinished episodes; refuse if they do not end in the same observations."""
+    """Restore the unfinished episodes; refuse if they do not end in the saved observations."""
     envs: Any = model.env
     last = starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):
@@ -279,7 +280,7 @@ def _pending(content: Content) -> dict[str, NDArray[Any]]:
 
 
 class _Log(Logger):
-    """Log in which iterations count from the beginning of the run, not of the process."""
+    """Logger that counts iterations from the beginning of the run, not of the process."""
 
     earlier = 0
 

@@ -1,8 +1,8 @@
 """Search for hyperparameters: Optuna proposes, Ray Tune runs trainings in parallel.
 
-Each trial trains a variant of the environment's recipe, in a run folder of its own. Its score is
-the mean success of the last three evaluations, plus a thousandth of their return, so that the
-return decides between equal successes.
+Each trial trains a variant of the environment's recipe, in a run folder of its own. The score of a
+trial is the mean success of its last three evaluations, plus a thousandth of their mean return. So
+the return decides between trials with equal success.
 """
 
 import os
@@ -57,7 +57,7 @@ _SPACE: Final[Mapping[str, Sequence[float]]] = {
 """Values to choose from, by entry of the recipe.
 
 Entries that an algorithm does not have are not searched. If the learning rate of the recipe falls
-to zero, the chosen learning rate does too.
+to zero, the chosen learning rate also falls to zero.
 """
 
 
@@ -78,7 +78,7 @@ class TuneConfig:
     """Steps of each training."""
 
     jobs: Annotated[int, unset(int, "one for each core", "INT")] = UNSET
-    """Trainings at a time, on this computer or on the Ray cluster that RAY_ADDRESS names."""
+    """Number of parallel trainings, on this computer or the Ray cluster that RAY_ADDRESS names."""
 
     seed: int = 0
     """Seed of the search; training i has this seed + i."""
@@ -127,7 +127,7 @@ def tune(config: TuneConfig) -> Path:
 
 
 def _search(config: TuneConfig, base: TrainingConfig, folder: Path) -> Mapping[str, Any]:
-    """Return the changes of the best trial."""
+    """Run all trials; return the best trial's changes to the recipe."""
     import ray
     from optuna.samplers import TPESampler
     from ray import tune as ray_tune
@@ -173,7 +173,11 @@ def _started(ray: Any, jobs: int | None) -> Iterator[None]:
 
 
 def _suggest(algorithm: str, trial: Any) -> dict[str, Any]:
-    """Let a trial of Optuna choose values; return the entries that are not searched."""
+    """Let Optuna choose the values of a trial; return an entry with the number of the trial.
+
+    Ray Tune records the chosen values and adds them to the returned entry. Both together are the
+    ``changes`` of the trial.
+    """
     known = ALGORITHMS[algorithm].entries().__annotations__
     for name, values in _SPACE.items():
         entries = known["policy_kwargs"].__annotations__ if "." in name else known
@@ -185,7 +189,7 @@ def _suggest(algorithm: str, trial: Any) -> dict[str, Any]:
 def _train(
     base: TrainingConfig, changes: Mapping[str, Any], folder: Path, seed: int, here: Path
 ) -> float:
-    """Train a variant of the recipe in the folder ``here``, and return its score."""
+    """Train a variant of the recipe, with the working directory ``here``; return its score."""
     number = changes["trial"]
     run, recipe, log = (folder / f"{number:03d}{end}" for end in ("", ".yml", ".log"))
     _write(recipe, base, changes)
@@ -202,7 +206,7 @@ def _train(
 
 
 def _write(file: Path, base: TrainingConfig, changes: Mapping[str, Any]) -> None:
-    """Write the recipe with the changes of a trial."""
+    """Write the recipe of ``base``, with the changes of a trial, to ``file``."""
     entries = {**base.recipe.entries(), "n_timesteps": base.steps}
     policy = entries["policy_kwargs"] = dict(entries.get("policy_kwargs", {}))
     for name, value in changes.items():

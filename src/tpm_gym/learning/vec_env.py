@@ -129,6 +129,6 @@ class AnalyticVecEnv(VecEnv):
 
 
 def _plant(entries: dict[str, Any]) -> Plant:
-    """Build a plant from JSON, which has lists for tuples."""
+    """Build a plant from JSON, which has lists in place of tuples."""
     tuples: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in entries.items()}
     return Plant(**tuples)

@@ -1,10 +1,10 @@
-"""Recipes for rl-baselines3-zoo.
+r"""Recipes for rl-baselines3-zoo.
 
     python -m rl_zoo3.train --algo sac --env TPMReach-v0 \
         --gym-packages tpm_gym --conf-file tpm_gym.learning.zoo
 
-The zoo imports this module and reads ``hyperparams``: the recipes of one algorithm, which is the
-zoo's option ``--algo``.
+The zoo imports this module and reads ``hyperparams``: the recipes of the algorithm that the zoo's
+option ``--algo`` names.
 """
 
 import argparse

@@ -19,7 +19,7 @@ from tpm_gym.arrays import FloatArray, Vector
 ALUMINIUM, STEEL = 2700.0, 7850.0  # kg/m^3
 
 LEVEL: Final = (0.0, 0.0, 0.0)
-"""Roll, pitch and yaw of a frame that is parallel to its parent's, rad."""
+"""Roll, pitch and yaw of a frame that is parallel to its parent frame, rad."""
 
 ALONG: Final = {"x": (0.0, math.pi / 2, 0.0), "y": (math.pi / 2, 0.0, 0.0), "z": LEVEL}
 """Roll, pitch and yaw that turn a cylinder along z onto the named axis, rad."""
@@ -47,7 +47,7 @@ class Solid:
         centre: Position in the link's frame, m.
         density: Density of the material, kg/m^3; zero for parts that are only drawn.
         bore: Size of the hollow, m. Box: edges (x, y, z). Cylinder: (inner radius, length, 0). All
-            are 0 if there is none.
+            three values are 0 for a solid without a hollow.
         axis: Axis of a cylinder in the solid's frame: ``"x"``, ``"y"`` or ``"z"``.
         colour: Name of a colour in :mod:`tpm_gym.mechanism.urdf`.
         collides: Whether the solid can touch objects and the table.
@@ -84,7 +84,7 @@ class Solid:
 
     @property
     def rotation(self) -> FloatArray:
-        """Matrix (3, 3) that turns a box, or a cylinder along z, to its place in the link."""
+        """Matrix (3, 3) that turns a box, or a cylinder along z, to its orientation in the link."""
         turn = rotation_of(self.rpy)
         return turn if self.kind == "box" else turn @ rotation_of(ALONG[self.axis])
 
@@ -125,10 +125,11 @@ class Joint:
         parent: Name of the parent link.
         origin: Position of the joint in the parent's frame, m.
         axis: Axis in the joint's frame.
-        lower: Lower limit, rad or m (motors and slide; the loops bound the others).
+        lower: Lower limit, rad or m. Only motors and slides need limits; the loops limit the other
+            joints.
         upper: Upper limit, rad or m.
         effort: Limit of torque or force, N m or N; zero for passive joints.
-        speed: Speed at which the motor has no effort left, rad/s or m/s; zero for passive joints.
+        speed: Speed at which the largest effort is zero, rad/s or m/s; zero for passive joints.
         corner: Highest speed with full effort, rad/s or m/s; from there to ``speed`` the effort
             falls linearly.
         rpy: Roll, pitch and yaw of the joint's frame in the parent's frame, rad, as in URDF.
@@ -251,7 +252,7 @@ class Mechanism:
         return [(link, link.joint) for link in self.links if link.joint]
 
     def link(self, name: str) -> Link:
-        """Return the link of that name.
+        """Return the link with this name.
 
         Raises:
             KeyError: If no link has this name.
@@ -266,7 +267,7 @@ class Mechanism:
 
     @cached_property
     def stops(self) -> tuple[tuple[float, float], ...]:
-        """Lowest and highest positions of the motors, rad or m; infinite for endless ones."""
+        """Lowest and highest positions of the motors, rad or m; infinite if there are no stops."""
         endless = (-math.inf, math.inf)
         return tuple(
             endless if motor.kind == "continuous" else (motor.lower, motor.upper)
@@ -277,8 +278,8 @@ class Mechanism:
         """Compute positions and orientations of all links in the base's frame.
 
         Args:
-            joints: Position (...,) of each joint by name, rad or m. A slide that is left out is
-                at 0 m.
+            joints: Position (...,) of each joint by name, rad or m. A slide that is not in
+                ``joints`` is at 0 m.
         """
         shape = np.shape(next(iter(joints.values())))
         identity = np.broadcast_to(np.eye(3), (*shape, 3, 3))

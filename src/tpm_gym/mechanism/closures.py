@@ -1,4 +1,4 @@
-"""Loop closures of any mechanism: their derivatives, and checks of a mechanism that is new.
+"""Loop closures of any mechanism: their derivatives, and checks of a new mechanism.
 
 Vectors are in the base's frame.
 """
@@ -31,8 +31,9 @@ def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> Float
     """Differentiate the gaps of all closures by the joint positions of the spanning tree.
 
     Returns:
-        (3 closures, joints) m/rad (m/m for a slide). Rows are x, y, z of ``point_a - point_b`` in
-        the order of ``mechanism.closures``, columns are in the order of :func:`moving_joints`.
+        (3 * number of closures, number of joints), m/rad (m/m for a slide). Rows are x, y, z of
+        ``point_a - point_b`` in the order of ``mechanism.closures``. Columns are in the order of
+        :func:`moving_joints`.
     """
     places = mechanism.places(angles)
     rows = [
@@ -62,8 +63,8 @@ def rates(
 
     Returns:
         Velocity of the point, m/rad (m/m for a slide), and angular velocity of the link, rad/rad,
-        for unit velocities of the joints. Both are (3, joints), in the order of
-        :func:`moving_joints`.
+        for unit velocities of the joints. Both are (3, number of joints), with columns in the order
+        of :func:`moving_joints`.
     """
     joints, point = moving_joints(mechanism), places[name].point(offset)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
@@ -80,7 +81,11 @@ def rates(
 
 
 def rank_of(values: FloatArray) -> int:
-    """Return the rank from singular values in descending order; SingularityError if uncertain."""
+    """Return the rank of a matrix from its singular values, which are in descending order.
+
+    Raises:
+        SingularityError: If the rank is uncertain.
+    """
     if not len(values):
         return 0
     rank = int((values > _ZERO * values[0]).sum())
@@ -102,8 +107,8 @@ def require_sound(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
         ConfigurationError: If a name is missing or not unique; if a link has no mass, or comes
             before its parent; if a joint or a solid is of an unknown kind; if an axis does not have
             length 1; if a solid has no positive size; if a loop is open at these joint positions;
-            if the platform turns; or if the motors do not have exactly three degrees of freedom,
-            alone or together with the platform.
+            if the platform turns; if there are not exactly three independent motors; or if the
+            platform can move while the motors stand still.
         SingularityError: If the rank of the closures' Jacobian is uncertain at these positions.
     """
     _require_parts(mechanism)

@@ -1,7 +1,7 @@
-"""Machines whose equations are compiled: loops over rows of robots.
+"""Machines whose equations are computed by compiled loops over many robots.
 
-The loops (:mod:`tpm_gym.mechanism.loops`) are imported when something is first computed, since they
-import Numba.
+The loops (:mod:`tpm_gym.mechanism.loops`) are imported at the first computation, since they import
+Numba.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from tpm_gym.mechanism.inertia import Bodies
 from tpm_gym.mechanism.machine import SAME_PLACE, Machine, Motion, Reading
 
 ASSEMBLY_LIMIT = 0.010
-"""Largest distance between P and the forward kinematics of the joint positions, m.
+"""Largest distance between P and the result of the forward kinematics for the joint positions, m.
 
 At a larger distance, the robot has left its assembly mode."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CompiledMachine(Machine):
-    """Machine that computes rows by a module of compiled loops.
+    """Machine whose results are computed by a module of compiled loops.
 
     Attributes:
         geometry: Link lengths.
@@ -40,7 +40,7 @@ class CompiledMachine(Machine):
     _module: ClassVar[str]
     """Name of the module whose LOOPS are the compiled loops."""
     _inertia_of: ClassVar[Any]
-    """Function of :class:`Bodies` and a geometry; it returns the constants of the dynamics."""
+    """Function (:class:`Bodies`, geometry) -> constants of the dynamics."""
 
     @property
     def _loops(self) -> Any:
@@ -164,7 +164,7 @@ class CompiledMachine(Machine):
         return self.built()[None], self._constants
 
     def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters of machines as built, and the constants that they share."""
+        """Return the parameters of machines as built, and the constants that all machines share."""
         rows, count = inputs.size // 3, len(built)
         if not count or rows % count:
             valid = f"parameters of b machines, with b a divisor of {rows} rows"
@@ -188,7 +188,7 @@ def _rows(values: ArrayLike, length: int = 3, name: str = "vectors") -> FloatArr
 
 
 def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
-    """Repeat vectors up to the shape of an array (..., 3)."""
+    """Broadcast vectors to the shape of an array (..., 3)."""
     plain = type(values) is np.ndarray and values.dtype.char == "d"  # the common case, fast
     array: Any = values if plain else numbers("vectors", values)
     if array.shape != like.shape:  # broadcast_to() is slow, and its result has to be copied

@@ -1,6 +1,6 @@
-"""The vacuum cup below the platform: its size, its spring, and when it seals.
+"""The vacuum cup below the platform: its size, its spring, and the condition for sealing.
 
-Engines simulate the cup; all of them use :func:`sealed`.
+Engines simulate the cup; all engines use :func:`sealed`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _SILICONE = 1150.0  # kg/m^3
 
 
 class VacuumCup(NamedTuple):
-    """A cup on a spring-loaded plunger, a level compensator.
+    """Vacuum cup on a spring-loaded plunger, which makers of cups call a level compensator.
 
     Attributes:
         length: Distance from point P of the platform to the lip, m.
@@ -27,8 +27,8 @@ class VacuumCup(NamedTuple):
         vacuum: Largest pressure difference to the ambient air, Pa.
         area: Area within the lip, on which the vacuum acts, m^2.
         evacuation_time: Time constant with which the vacuum builds up in a sealed cup, s, for an
-            ejector of 5 l/min on a cup and hose of 1.6 cm^3.
-        venting_time: Time constant with which air comes in, through the valve or below the lip, s.
+            ejector of 5 l/min and a volume of 1.6 cm^3 in cup and hose.
+        venting_time: Time constant with which air enters through the valve or below the lip, s.
         least_vacuum: Vacuum at which the lip comes off when the valve is closed, Pa.
         friction: Friction of the open lip. Its product with the object's friction is the Coulomb
             coefficient between them.
@@ -66,7 +66,7 @@ class VacuumCup(NamedTuple):
         return Solid("cylinder", size, (x, y, z + half), ALUMINIUM, colour="steel")
 
     def link(self, platform: str, point_p: Vector) -> Link:
-        """Build the cup as a link that slides in the platform of that name."""
+        """Build the cup as a link that slides in the link ``platform`` at point P."""
         size, middle = (self.radius, self.bellows, 0.0), (0.0, 0.0, self.length - self.bellows / 2)
         bellows = Solid("cylinder", size, middle, _SILICONE, colour="violet", collides=True)
         size, middle = (0.003, 0.04, 0.0), (0.0, 0.0, self.length - 0.02)
@@ -84,8 +84,8 @@ CUP = VacuumCup()
 def sealed(lip: Any, axis: Any, position: Any, quaternion: Any, size: tuple[float, float]) -> Any:
     """Return whether the whole lip lies on the top face of a square block, so that it seals.
 
-    Gap and tilt may be up to ``CUP.seal_gap`` and ``CUP.seal_tilt``.
-    Arrays (n,) in place of numbers give an array (n,). Vectors are in the world frame.
+    Gap and tilt may be up to ``CUP.seal_gap`` and ``CUP.seal_tilt``. If the components are arrays
+    (n,) instead of numbers, the result is an array (n,). Vectors are in the world frame.
 
     Args:
         lip: Centre of the lip, m.

@@ -26,7 +26,7 @@ _REST = (0.0, 0.0, 0.0)
 
 
 class Energy(NamedTuple):
-    """Kinetic and potential energy (...,), J; the latter up to a constant of the machine."""
+    """Kinetic energy, and potential energy up to a constant of the machine; (...,) J each."""
 
     kinetic: FloatArray
     potential: FloatArray
@@ -57,8 +57,9 @@ class Formulas(NamedTuple):
 class EquationOfMotion(ABC):
     """The dynamics of one mechanism, for points and batches.
 
-    Joint angles (rad), rates (rad/s) and their changes (rad/s^2) are arrays (..., 3) that broadcast
-    with each other; torch tensors among them give tensors, in float64, that can be differentiated.
+    Joint positions (rad), velocities (rad/s) and accelerations (rad/s^2) are arrays (..., 3) that
+    broadcast with each other. If an argument is a torch tensor, the results are tensors in float64,
+    which can be differentiated.
 
     All methods raise InputError for inputs that are no arrays (..., 3) of finite numbers,
     UnreachableError if the assembly mode does not exist at some theta, and SingularityError at a
@@ -72,8 +73,8 @@ class EquationOfMotion(ABC):
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
 
     Raises:
-        ConfigurationError: If a mass or gravity is not possible. A wrong number of factors is
-            found at the first use.
+        ConfigurationError: If a mass or gravity is not possible. A wrong number of factors raises
+            this error at the first use.
     """
 
     geometry: Any
@@ -120,7 +121,7 @@ class EquationOfMotion(ABC):
         return self._rows(lambda pose: [self._masses(pose)], {"theta": theta})[0]
 
     def coriolis(self, theta: ArrayLike, theta_dot: ArrayLike) -> FloatArray:
-        """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols, so that M' - 2 C is skew."""
+        """Compute C (..., 3, 3) kg m^2/s from Christoffel's symbols; so dM/dt - 2 C is skew."""
 
         def results(pose: Any, rates: Triple) -> list[Numbers]:
             def quadratic(sign: float, k: int) -> Triple:
@@ -160,7 +161,7 @@ class EquationOfMotion(ABC):
 
     @abstractmethod
     def _pose(self, theta: Triple, ns: Namespace) -> tuple[Any, Numbers, Numbers]:
-        """Return the configuration at theta, whether it is real, and whether J exists there."""
+        """Return the configuration at theta, whether it exists, and whether J exists there."""
 
     @abstractmethod
     def _refusal(self, theta: Vector) -> UnreachableError | SingularityError:
@@ -177,7 +178,11 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Apply the function ``text`` of a pose and triples to each row of the states."""
+        """Call the function ``text`` with the pose at theta and with the other states.
+
+        Returns:
+            Results of ``text`` for all rows.
+        """
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
             theta, *rest = (values[i : i + 3] for i in range(0, len(values), 3))

@@ -5,12 +5,12 @@ A rigid bar from B to C has the kinetic energy of two coupled points:
     T = (a |vB|^2 + 2 b vB . vC + c |vC|^2) / 2,
     a = m (1 - s)^2 + I / l^2,  b = m s (1 - s) - I / l^2,  c = m s^2 + I / l^2.
 
-Here m is its mass, l its length, s l the distance of its centre of mass from B, and I its moment of
-inertia about an axis through this centre, across the bar.
+Here m is the mass of the bar, l its length, s l the distance of its centre of mass from B, and I
+its moment of inertia about an axis through the centre of mass, perpendicular to the bar.
 
 Arms (with a fixed near end) and rods are such bars. A body that only translates is a mass at the
 point with which it moves. Some bodies swing with their rods, and some rods also turn about their
-own axes (:class:`Swing`).
+own axes; see :class:`Swing`.
 """
 
 from __future__ import annotations
@@ -31,14 +31,15 @@ _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
 
 class Swing(NamedTuple):
-    """Inertia of a leg's swing in addition to its bars: T = (fixed + spin out^2) rate^2 / 2.
+    """Part of a leg's inertia that is not in the leg's bars.
 
-    Here ``rate`` is the angular velocity of the swing, rad/s, and ``out`` is the component of BC
-    along the swing's axis, m.
+    The swing is the rotation of the rods in the plane of the arm. This part of the inertia has the
+    kinetic energy T = ``(fixed + spin * out**2) * rate**2 / 2``. ``rate`` is the angular velocity
+    of the swing, rad/s, and ``out`` is the component of BC along the axis of the swing, m.
 
     Attributes:
         fixed: Moment of inertia about the axis of the swing, kg m^2.
-        spin: Moment of inertia of the rods about their own axes, over l4^2, kg.
+        spin: Moment of inertia of the rods about their own axes, divided by l4^2, kg.
     """
 
     fixed: Numbers
@@ -48,7 +49,7 @@ class Swing(NamedTuple):
 def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m: Swing) -> Triple:
     """Compute the force at C, N, that accelerates the swing of a leg; the force at B is opposite.
 
-    It follows from Lagrange's equation of the kinetic energy of :class:`Swing`.
+    The force follows from Lagrange's equation for the kinetic energy of :class:`Swing`.
 
     Args:
         rod: BC as (out, level, z), m. The swing is the angle of (level, z), with its axis along
@@ -67,10 +68,10 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
 
 
 class Bodies:
-    """Moving links by name, with factors of their masses; remembers which links were used."""
+    """Moving links by name, with factors of their masses, and a record of the links in use."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Set factors of mass and inertia, one for each moving link; empty if all are 1.
+        """Set one factor of mass and inertia for each moving link; without factors, all are 1.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.

@@ -1,4 +1,4 @@
-"""Compiled loops over rows of a mechanism's kinematics and dynamics.
+"""Compiled loops over rows, which compute a mechanism's kinematics and dynamics.
 
 A loop takes five arguments:
 
@@ -9,8 +9,9 @@ A loop takes five arguments:
 * ``machine``: the signs of the modes, then gravity (3), m/s^2.
 * ``results``: a tuple of arrays with n rows, which the loop fills; NaN where there is no solution.
 
-A row does not depend on the others, so it has the same bits alone and among thousands. Rows are
-copied to columns of a block, so that the compiler can compute several rows at a time.
+A row does not depend on the others. So a call with one row and a call with thousands of rows give
+this row equal results, bit for bit. Rows are copied to columns of a block, so that the compiler can
+compute several rows at a time.
 """
 
 import math
@@ -33,24 +34,25 @@ _NONE: Final = (0.0, 0.0, 0.0)
 
 
 class Equations(NamedTuple):
-    """Functions of one mechanism that the loops call; all of them are compilable.
+    """Functions of one mechanism, called by the loops over rows; all of them are compilable.
 
     Each attribute is given as (arguments) -> results. ``columns`` hold lengths and constants of the
-    machines; functions return those of row j. ``rates`` and ``changes`` are the first and second
-    derivatives of the joint positions by time.
+    machines; functions return the values of row j. ``rates`` and ``changes`` are the first and
+    second derivatives of the joint positions by time.
 
     Attributes:
         modes: (machine) -> signs of the modes.
         lengths: (columns, j) -> lengths of row j.
         inertia: (columns, j) -> constants of the dynamics of row j.
-        posture: (point, modes, lengths) -> joint positions; whether they are real.
-        pose: (joint positions, modes, lengths) -> configuration; whether it is real; whether it is
+        posture: (point, modes, lengths) -> joint positions; whether they exist.
+        pose: (joint positions, modes, lengths) -> configuration; whether it exists; whether it is
             in the working mode.
         position: (configuration) -> point P.
         regular: (configuration, lengths) -> whether J exists.
         velocity: (configuration) -> rows of J.
         same_side: (configuration, point, modes, lengths) -> whether the point is on the assembly
-            mode's side. Use only the arms of the configuration, since the rest may not be real.
+            mode's side. The function may use only the arms of the configuration, since the
+            mechanism may have no assembly.
         torques: (configuration, rates, changes, gravity, inertia) -> torques.
         gather: (configuration, force at P) -> torques J^T force.
         masses: (configuration, J, inertia) -> upper triangle of M.
@@ -85,7 +87,7 @@ def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) ->
 def _place(
     columns: FloatArray, j: int, position: Triple, rows: tuple[Triple, Triple, Triple], real: bool
 ) -> None:
-    """Write P and the rows of J to the first 12 columns of row j; NaN if not ``real``."""
+    """Write P and the rows of J to the first 12 columns of row j; NaN if there is no solution."""
     _put(columns, 0, j, position, real)
     _put(columns, 3, j, rows[0], real)
     _put(columns, 6, j, rows[1], real)
@@ -95,8 +97,8 @@ def _place(
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
     """Fill the columns ``own`` with the machine parameters of ``count`` rows from ``start`` on.
 
-    Each machine has ``each`` rows. If all rows belong to one machine, only the first block fills
-    the columns, and all blocks use them.
+    ``each`` is the number of rows of one machine. If all rows belong to one machine, only
+    the first block fills the columns, and all blocks use them.
     """
     if start == 0 or len(built) > 1:
         for j in range(count):
@@ -210,7 +212,11 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         found[12, j] = conditioning(rows, NS) if real else math.nan
 
     def conditioning_at(block: _Block, j: int) -> None:
-        """Compute 1/cond(J) for P; 0 unless the machine's modes reach P within the limit."""
+        """Compute 1/cond(J) for P.
+
+        The result is 0 if P is out of reach, if J does not exist, or if the forward kinematics
+        return a point that differs from P by the limit or more.
+        """
         g, point, limit = lengths(block.own, j), get(block.given, 0, j), block.limit
         angles, reached = posture(point, block.modes, g)
         at, there, _ = pose(angles, block.modes, g)

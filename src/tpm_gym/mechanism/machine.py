@@ -1,9 +1,9 @@
-"""Machines: translational robots with closed-form kinematics, as frozen values.
+"""Machines: translational robots with closed-form kinematics, as frozen dataclasses.
 
 A :class:`Machine` has forward and inverse kinematics, the Jacobian, modes, dynamics, regions, and
-the bodies to load. So other robots (a Delta, a gantry) serve the same tasks.
+the bodies that engines load. So other robots (a Delta, a gantry) can do the same tasks.
 
-Arrays (..., 3) have one robot a row, and (x, y, z) or the three joints along the last axis.
+Arrays (..., 3) have one robot per row, and (x, y, z) or the three joints along the last axis.
 Everything is in SI units and in the machine's own frame; its
 :class:`~tpm_gym.mechanism.mount.Mount` places this frame in the world. Joint positions theta are in
 rad (m for a slide). Results are NaN in rows without a solution.
@@ -41,8 +41,8 @@ MODES: Final = (None, "assembly", "working")
 """Names of the modes that :meth:`Machine.mode_left` returns as 0, 1 and 2."""
 
 SAME_PLACE: Final = 1e-6
-"""Largest distance between equal positions, m; far below the distance between assembly modes at a
-safe conditioning."""
+"""Largest distance between positions that count as equal, m; far below the distance between the
+assembly modes at a safe conditioning."""
 
 
 class Reading(NamedTuple):
@@ -67,8 +67,8 @@ class Motion(NamedTuple):
     The first three attributes are explained in :class:`Reading`.
 
     Attributes:
-        mass: Inertia that the motors feel, (..., 3, 3) kg m^2.
-        bias: Torque for weight and velocities, (..., 3) N m.
+        mass: Mass matrix at the motors' axes, (..., 3, 3) kg m^2.
+        bias: Torques for weight and velocities, (..., 3) N m.
     """
 
     position: FloatArray
@@ -93,16 +93,17 @@ class Machine(ABC):
         joint_limit: Largest change of a joint's command in 40 ms, rad (m for a slide).
         safe_conditioning: Smallest conditioning 1/cond(J) that counts as safe from singularities;
             the penalty of the reward begins below it.
-        table: Half edges of the table along x and y, m; its top is the world's z = 0.
+        table: Half edges of the table along x and y, m; the table top is at z = 0 in the world.
         payload: Mass that a gripper holds at point P, kg; :attr:`mechanism` contains it.
-        mirror_axis: Axis (0, 1, 2) normal to a plane of symmetry through the origin. P may pass
-            this plane, a parallel singularity, into the mirror image of the assembly mode. None for
-            a machine that has to stay in its assembly mode.
+        mirror_axis: Axis (0, 1, 2) normal to a plane of symmetry through the origin. This plane is
+            a parallel singularity, which P may pass; the machine then is in the mirror image of its
+            assembly mode. None for a machine that has to stay in its assembly mode.
 
     Raises:
         ConfigurationError: If a value is not possible, if home or the goals lie outside the region,
-            if the region reaches beyond a singularity, a motor's stop or (by more than the cup's
-            stroke) the table, or if the loops of the mechanism do not close at home.
+            if the region reaches beyond a singularity or a motor's stop, if it reaches below the
+            table by more than the cup's stroke, or if the loops of the mechanism do not close at
+            home.
         UnreachableError: If a corner of the region cannot be reached.
     """
 
@@ -144,7 +145,7 @@ class Machine(ABC):
             raise ConfigurationError("mount", self.mount, valid)
 
     def _require_values(self) -> None:
-        """Reject other types and numbers that are not finite; convert arrays to tuples."""
+        """Reject wrong types, and numbers that are not finite; convert arrays to tuples."""
         for name, kind in (("mount", Mount), ("region", Region), ("goal_region", Region)):
             if not isinstance(getattr(self, name), kind):
                 raise ConfigurationError(name, getattr(self, name), f"a {kind.__name__}")
@@ -156,7 +157,12 @@ class Machine(ABC):
         object.__setattr__(self, "table", tuple(table.tolist()))
 
     def _require_usable(self, name: str, points: list[Vector]) -> FloatArray:
-        """Return joint positions (k, 3); reject ``name`` if a point is beyond reach or a limit."""
+        """Return joint positions (k, 3) for points (k, 3) of the attribute ``name``.
+
+        Raises:
+            UnreachableError: If a point is out of reach.
+            ConfigurationError: If a point is beyond a singularity or a motor's stop.
+        """
         try:
             theta, left = self._postures(np.array(points))
         except UnreachableError as error:
@@ -207,19 +213,26 @@ class Machine(ABC):
         """Find the mode that a machine has left, from its joint positions and the position of P.
 
         Returns:
-            (...,): 0 for none. 1 for the assembly mode: the machine passed a parallel singularity,
-            so that the forward kinematics no longer give P. 2 for the working mode: it passed a
-            serial singularity, so that the inverse kinematics no longer give its joints.
+            (...,): 0, 1 or 2. 0: the machine left no mode. 1: it left the assembly mode, because it
+            passed a parallel singularity, so that the forward kinematics no longer give P. 2: it
+            left the working mode, because it passed a serial singularity, so that the inverse
+            kinematics no longer give its joint positions.
         """
         del theta, built
         return np.zeros(np.shape(position)[:-1], dtype=np.int8)
 
     def same_side(self, position: ArrayLike) -> BoolArray:
-        """Return whether P at ``position`` (..., 3) is on the assembly mode's side, as (...,)."""
+        """Return whether P at ``position`` (..., 3) m is on the assembly mode's side, as (...,).
+
+        The parallel singularities divide the workspace into sides.
+        """
         return np.ones(np.shape(position)[:-1], dtype=np.bool_)
 
     def mirrored(self) -> Machine:
-        """Return the machine with home and assembly mode beyond the plane of ``mirror_axis``."""
+        """Return the machine with its home and its assembly mode mirrored.
+
+        The mirror is the plane of symmetry normal to ``mirror_axis``.
+        """
         raise NotImplementedError(f"{self.name}: mirror_axis is None")
 
     def unreachable(self, position: Vector) -> UnreachableError:
@@ -246,7 +259,7 @@ class Machine(ABC):
 
         Raises:
             UnreachableError: If the machine cannot be assembled.
-            SingularityError: If it is at a parallel singularity.
+            SingularityError: If the machine is at a parallel singularity.
         """
         reading = self.evaluate(theta, built)
         if np.isnan(reading.conditioning).any():
@@ -290,7 +303,7 @@ class Machine(ABC):
     def conditioning_at(self, position: ArrayLike) -> FloatArray:
         """Compute 1/cond(J) (...,) with P at ``position`` (..., 3) m; 0 where P cannot go.
 
-        Positions that the working mode reaches in another assembly mode give 0 too.
+        The result is also 0 where the machine would have to be in another assembly mode.
         """
         found, _, conditioning, _ = self.evaluate(self.inverse(position))
         there = np.abs(np.subtract(found, position)).max(axis=-1) < SAME_PLACE
@@ -329,13 +342,14 @@ class Machine(ABC):
     ) -> FloatArray:
         """Compute the motors' torques (..., 3) N m (N for a slide) for a motion.
 
-        The base class computes them from the bodies by differences, which takes milliseconds a row.
+        The base class computes the torques from the bodies by finite differences, which takes
+        milliseconds for each row.
 
         Args:
             theta: Joint positions (..., 3).
             theta_dot: Joint velocities (..., 3) per s.
             theta_ddot: Joint accelerations (..., 3) per s^2.
-            force: Force on P (..., 3) N that the motors hold against; None for none.
+            force: Force on P (..., 3) N that the motors hold against; None for no force.
             built: Parameters of the machines, as for :meth:`inverse`.
         """
         motion = np.stack(np.broadcast_arrays(theta, theta_dot, theta_ddot), axis=-2, dtype=float)
@@ -383,8 +397,9 @@ class Machine(ABC):
         """Return the parameters (k,) of one machine as it was built.
 
         Args:
-            lengths: Its lengths, m, in the order of :attr:`lengths`; empty for the nominal ones.
-            link_masses: Factors of the mass and inertia of its moving links; empty if all are 1.
+            lengths: Lengths of the machine, m, in the order of :attr:`lengths`; empty for the
+                nominal lengths.
+            link_masses: Factors of mass and inertia of the moving links; empty if all are 1.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.

@@ -18,7 +18,8 @@ SOLID = "solid"
 """Class of geoms that collide; geoms of the other class are only drawn."""
 
 STIFF = "0.9999 0.9999 0.001 0.5 2"
-"""Impedance (solimp) of rigid constraints: the largest that MuJoCo takes, for any gap."""
+"""Impedance (solimp) of rigid constraints: the largest that MuJoCo accepts. It is equal for gaps of
+any size."""
 
 # The file's time step (s), and its servos: N m/rad and N m s/rad.
 _TIME_STEP, _STIFFNESS, _DAMPING = 0.0005, 20000.0, 130.0
@@ -83,7 +84,7 @@ def site_names(closure: str) -> tuple[str, str]:
 
 
 def mjcf_text(machine: Machine) -> str:
-    """Write the robot over a table, with servos as motors, for MuJoCo without tpm_gym."""
+    """Write MJCF for MuJoCo without tpm_gym: the robot over a table, with servos as motors."""
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))

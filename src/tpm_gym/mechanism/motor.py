@@ -5,12 +5,13 @@ A direct drive has no gear. Its torque follows from the magnetic shear stress si
     T = 2 pi r^2 L sigma,
 
 with the gap's radius r and the length L of the iron. Frameless torque motors reach 30 to 60 kPa for
-seconds, and 10 to 20 kPa continuously without a fan. The gap's radius gives the rotor, a ring of
-iron with magnets, whose inertia is not negligible beside the arm's.
+seconds, and 10 to 20 kPa continuously without a fan. The gap's radius determines the size of the
+rotor, a ring of iron with magnets. The rotor's inertia is not negligible compared with the arm's.
 
-The voltage of the amplifier limits the speed. With the motor constant K (N m per root of a watt
-lost in the winding) and the no-load speed w0, the largest torque at a speed w is K^2 (w0 - w). So
-the peak torque T is available up to the corner speed, w0 - T / K^2.
+The voltage of the amplifier limits the speed. The motor constant K is the torque over the square
+root of the power that the winding loses as heat, N m/sqrt(W). With K and the no-load speed w0, the
+largest torque at a speed w is K^2 (w0 - w). So the peak torque T is available up to the corner
+speed, w0 - T / K^2.
 """
 
 from __future__ import annotations
@@ -31,10 +32,10 @@ class Motor:
     """Frameless torque motor: equal halves on one shaft, one on each side of the arm.
 
     Attributes:
-        peak_torque: Torque of both halves together, for seconds, N m.
+        peak_torque: Torque that both halves together can apply for seconds, N m.
         continuous_torque: Continuous torque of both halves together, N m.
         motor_constant: Motor constant, N m/sqrt(W).
-        no_load_speed: Speed at which the amplifier's voltage leaves no torque, rad/s.
+        no_load_speed: Speed at which the amplifier's voltage allows no torque, rad/s.
         gap_radius: Radius of the air gap, m.
         length: Length of the iron of both halves together, m.
         ring: Thickness of the rotor's ring, iron and magnets, m.

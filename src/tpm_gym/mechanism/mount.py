@@ -1,4 +1,4 @@
-"""Mount of the robot over the table: conversion between its frame and the world frame."""
+"""Mount of the robot over the table: conversion between machine's frame and world frame."""
 
 from __future__ import annotations
 

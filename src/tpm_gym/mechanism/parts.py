@@ -13,8 +13,9 @@ from tpm_gym.mechanism.motor import TORQUE_MOTOR
 
 CARBON_FIBRE = 1600.0  # kg/m^3
 SLIDES: Final = ("platform_x", "platform_y", "platform_z")
+"""Prismatic joints of :func:`free_platform`; their positions are the coordinates of P, m."""
 TURNS: Final = ("platform_roll", "platform_pitch", "platform_yaw")
-"""Revolutes of :func:`free_platform`, always at 0 rad; its SLIDES are at P, m."""
+"""Revolute joints of :func:`free_platform`; their positions are always 0 rad."""
 FREE: Final = ("along_x", "along_y", "along_z", "rolling", "pitching")
 """Links of :func:`free_platform` between base and platform."""
 
@@ -59,7 +60,7 @@ def load(payload: float, centre: Vector) -> tuple[Solid, ...]:
 
 
 def rod(axis: Literal["x", "y"], length: float) -> tuple[Solid, ...]:
-    """Build a carbon-fibre tube, 16 mm by 1.5 mm, with a steel rod end at both ends."""
+    """Build a carbon-fibre tube (diameter 16 mm, wall 1.5 mm) with steel rod ends."""
     fibre = bar(axis, length / 2, 0.008, displaced(axis, length / 2), "carbon", CARBON_FIBRE)
     ends = (
         bar(axis, 0.008, 0.009, displaced(axis, at), density=STEEL)
@@ -73,8 +74,8 @@ def motor(
 ) -> Joint:
     """Build the joint of a motor.
 
-    Its arm points outwards at theta = ``level``. ``sense`` (1 or -1) is the direction of theta in
-    which the arm turns towards the platform.
+    The motor's arm points outwards at theta = ``level``. ``sense`` (1 or -1) is the direction of
+    theta in which the arm turns towards the platform.
     """
     lower, upper = sorted((level - sense * ARM_RAISED, level + sense * ARM_LOWERED))
     line = TORQUE_MOTOR.peak_torque, TORQUE_MOTOR.no_load_speed, TORQUE_MOTOR.corner_speed

@@ -1,11 +1,12 @@
 """URDF text of a Mechanism, and the file of loop closures beside it.
 
-URDF describes trees only. Ours has a massless link at either end of each closure. The file beside
-it pairs these links in the extended-URDF convention of Gepetto's example-parallel-robots:
-``closed_loop`` lists pairs of frames, ``type`` gives the kind of each closure (``3d``: the origins
-coincide, as in a ball joint), and ``name_mot`` names the motors' joints. Pinocchio closes the loops
-from the two files alone, by ``completeRobotLoader(folder, "tpm.urdf", "tpm.loops.yaml")``. The
-files do not contain gravity. The base hangs upside down over a table, so objects fall along +z.
+URDF describes trees only. The tree written here has a massless link at each end of each closure.
+The second file pairs these links in the extended-URDF convention of Gepetto's
+example-parallel-robots: ``closed_loop`` lists pairs of frames, ``type`` gives the kind of each
+closure (``3d``: the origins coincide, as in a ball joint), and ``name_mot`` names the motors'
+joints. With the two files alone, Pinocchio closes the loops:
+``completeRobotLoader(folder, "tpm.urdf", "tpm.loops.yaml")``. The files do not contain gravity. The
+base hangs upside down over a table, so objects fall along +z.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
 
 
 def add(parent: Element, tag: str, **values: str | float | Iterable[float]) -> Element:
-    """Add an element, with text, a number or numbers as the values of its attributes."""
+    """Add an element; the values of its attributes are text, a number or several numbers."""
     return SubElement(parent, tag, {name: _text(value) for name, value in values.items()})
 
 
@@ -117,7 +118,7 @@ def _sides(closure: Closure) -> tuple[tuple[str, str, Vector], tuple[str, str, V
 
 
 def _add_frame(root: Element, name: str, parent: str, point: Vector) -> None:
-    """Add a massless link at ``point`` (m) of another, and the joint that fixes it there."""
+    """Add a massless link at ``point`` (m) of the link ``parent``, with a fixed joint."""
     inertial = add(add(root, "link", name=name), "inertial")  # else some loaders assume 1 kg
     add(inertial, "mass", value=0)
     add(inertial, "inertia", **dict.fromkeys(_MOMENTS, 0))
@@ -141,7 +142,7 @@ def _add_link(root: Element, link: Link) -> None:
 
 
 def _collision_shapes(solid: Solid) -> list[Solid]:
-    """Return a box as it is, and a cylinder as three: its ends, and the part between them."""
+    """Return a box as one shape, and a cylinder as three: its ends, and the part between them."""
     radius, length, _ = solid.size
     if solid.kind == "box" or length <= 2 * _END:
         return [solid]

@@ -1,6 +1,6 @@
 """Trained policies without pickle: :func:`load_policy` and :class:`Policy`.
 
-Needs the extra ``policy``, which is imported when either name is first used.
+Both need the extra ``policy``, whose packages are imported when one of the two is first used.
 """
 
 from typing import TYPE_CHECKING, Any

@@ -2,8 +2,9 @@
 
 ``NAME.json`` describes the policy: its network, spaces, environment, recipe and versions.
 ``NAME.safetensors`` holds the weights. Both are plain data of a limited size; nothing in them is
-executed or unpickled. SHA-256 sums in the JSON show damage, and files that do not belong together.
-A forged file with new sums can make a policy act badly, but cannot run code.
+executed or unpickled. The JSON contains SHA-256 sums. They reveal a damaged file, and also
+two files that do not belong together. A forged file with new sums can make a policy act badly, but
+cannot run code.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class Network(_Entries):
 
 
 class Weights(_Entries):
-    """Size and sum of the file of weights."""
+    """Size (bytes) and SHA-256 of the file of weights."""
 
     bytes: Annotated[int, Field(ge=0, le=MAX_WEIGHTS)]
     sha256: str
@@ -221,7 +222,7 @@ def published() -> list[str]:
 
 
 def _refused(file: Path, cause: str) -> PolicyFileError:
-    """Return an error; the cause may quote the file, so it is cut and made printable."""
+    """Return an error. ``cause`` may quote the file, so its text is cut and made printable."""
     reason = f"is not a policy file: {cause[:200].encode('unicode_escape').decode()}"
     remedy = "get an intact copy of both files, export the policy again, or update tpm_gym"
     return PolicyFileError(str(file), reason, remedy)

@@ -20,8 +20,8 @@ from tpm_gym.resources import POLICIES
 _BLOCK = 8
 """Rows of a batch that are multiplied at once.
 
-OpenBLAS uses no threads for so few rows. So an action has the same bits alone and in a batch, and
-threads do not slow each other down on a busy computer.
+OpenBLAS uses no threads for so few rows. So an observation gives the same action, bit for bit,
+alone or in a batch, and threads do not slow each other down on a busy computer.
 """
 
 
@@ -29,12 +29,12 @@ def load_policy(path: str | Path) -> Policy:
     """Load an exported policy. Nothing in its files is executed or unpickled.
 
     Args:
-        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; both files must exist. Or the id of
-            an environment with a published policy, such as ``"TPMPickAndPlace-v0"``, if neither
-            file exists.
+        path: ``NAME.json``, ``NAME.safetensors`` or ``NAME``; the JSON file and the file of weights
+            must both exist. If neither exists, ``path`` may be the id of an environment with a
+            published policy, such as ``"TPMPickAndPlace-v0"``.
 
     Raises:
-        InputError: ``path`` is neither a str nor a Path, or empty.
+        InputError: ``path`` is empty, or is neither a str nor a Path.
         PolicyFileError: A file is missing or is not that of a policy, or ``path`` is an archive of
             Stable-Baselines3, which only unpickling could read.
         MissingPackageError: safetensors or pydantic is not installed.
@@ -117,8 +117,8 @@ class Policy:
     def check(self, env: Any) -> None:
         """Check that the policy fits an environment.
 
-        Spaces are compared. So is the control of environments of tpm_gym, since Cartesian
-        increments and joint increments have equal spaces. The machine may differ.
+        The spaces are compared. For an environment of tpm_gym, the control is compared too, since
+        Cartesian increments and joint increments have equal spaces. The machine may differ.
 
         Args:
             env: Environment of Gymnasium, wrapped or not, or vector environment of Gymnasium or of
@@ -183,7 +183,7 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
 
 
 def _control(env: Any) -> str | None:
-    """Return the name of an environment's control; None if it is not of tpm_gym."""
+    """Return the name of an environment's control; None if the environment is not of tpm_gym."""
     if hasattr(env, "has_attr") and env.has_attr("control"):  # of Stable-Baselines3
         return getattr(env.get_attr("control")[0], "name", None)
     own = getattr(env, "unwrapped", env)

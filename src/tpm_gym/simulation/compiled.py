@@ -59,7 +59,7 @@ def shifted(
 def bounded(
     observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
-    """Clip observations and achieved goals to +-bounds, and convert them and goals to float32.
+    """Clip observations and achieved goals to +-bounds; convert both and the goals to float32.
 
     Returns:
         The three arrays in float32, and whether observations and achieved goals have no NaN.
@@ -92,7 +92,9 @@ def in_world(
     turn: FloatArray,
     origin: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, BoolArray, BoolArray, bool]:
-    """Convert P, its velocity and its command to the world frame; find axes, modes, open loops.
+    """Convert P, its velocity and its command to the world frame, and check modes and loops.
+
+    Also compute the z axes of the objects.
 
     Args:
         position: (n, 3) m, point P, machine's frame.
@@ -100,17 +102,18 @@ def in_world(
         theta_dot: (n, 3) rad/s.
         commands: (n, 3, 3) m, machine's frame; commands[:, 1] is converted.
         quaternion: (n, k, 4), orientations of the objects, world.
-        left: (n,) mode that each robot has left now: 1 assembly, 2 working.
+        left: (n,) mode that each robot has left now: 0 none, 1 assembly, 2 working.
         mode_left: (n,) mode that each robot left first; overwritten.
         gap: (n,) m, largest gap of each robot. If it is above ``limit`` or NaN, a loop is open.
         limit: Largest allowed gap, m.
-        turn: (3,) factors (1 or -1) of the machine's axes in the world frame.
+        turn: (3,) signs (1 or -1). The components of a vector in the machine's frame times these
+            signs are its components in the world frame.
         origin: (3,) m, origin of the machine's frame in the world frame.
 
     Returns:
-        P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, z axes (n, k, 3) of the objects;
-        world frame. Whether the assembly mode and the working mode was left, (n,). Whether all
-        loops are closed.
+        Four arrays in the world frame: P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, and
+        z axes (n, k, 3) of the objects. Two arrays (n,): whether the assembly mode was left, and
+        whether the working mode was left. A bool: whether all loops are closed.
     """
     place, speed = np.empty_like(position), np.empty_like(position)
     wanted, axes = np.empty_like(position), np.empty((*quaternion.shape[:2], 3))
@@ -167,8 +170,8 @@ def measured(
 
     Returns:
         (n, 9 + 12 k): position, velocity, command minus position; then for each object its centre,
-        its top minus the lip, its velocity, x and y of its z axis, and vacuum / most if it is held,
-        else 0.
+        the vector from the lip to the middle of its top, its velocity, the x and y components of
+        its z axis, and vacuum / most if it is held, else 0.
     """
     values = np.empty((len(position), 9 + 12 * len(halves)))
     for row in range(len(position)):

@@ -129,12 +129,13 @@ class ServoDrives:
     """Servo drives of n robots, in an engine with a fixed time step.
 
     A real amplifier updates the torque about 10,000 times per second. An engine updates it only a
-    few hundred times per second. At the engine's rate, the servo law with the joint positions at
-    the beginning of a time step is unstable at the stiffness of a real axis. So the law uses the
-    predicted joint positions at the end of the time step (backward Euler), which is stable at any
-    stiffness. The prediction uses the inertia M and the load: the last time step's torque minus M
-    times the last acceleration. The static stiffness equals ``stiffness`` under any load. The
-    damping is larger than ``damping`` by ``stiffness`` x ``time_step``.
+    few hundred times per second. With the engine's rate and the stiffness of a real axis, a servo
+    law that uses the joint positions at the beginning of a time step is unstable. So the law uses
+    the predicted joint positions at the end of the time step (backward Euler). This law is stable
+    at any stiffness. The prediction uses the inertia M and the load. The load is the torque in the
+    last time step minus M times the acceleration in the last time step. The static stiffness equals
+    ``stiffness`` under any load. The damping is larger than ``damping`` by ``stiffness`` x
+    ``time_step``.
 
     Args:
         servo: Parameters of the servo law.

@@ -205,7 +205,7 @@ class Path:
 
 @cache
 def loops() -> ModuleType:
-    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, and with them Numba."""
+    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, which import Numba."""
     from tpm_gym.simulation import compiled
 
     return compiled
@@ -301,7 +301,11 @@ class Engine(Protocol):
         """
 
     def restore(self, saved: Any) -> None:
-        """Continue from a result of ``save``; robots and plants are the same as at ``save``."""
+        """Continue from a result of ``save``.
+
+        The engine has the same robots as at ``save``, and the caller has already applied their
+        plants.
+        """
 
     def show(self, camera: Camera, markers: FloatArray) -> None:
         """Update the window: its camera, the first robot, and the goal markers, (k, 3) m.
@@ -334,7 +338,8 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
         engine: Callable that creates the engine, or ``"module:attribute"``, which is imported at
             the first use. The callable may have the keywords ``gui`` (open a window),
             ``renderer``, ``physics`` (numerical settings) and ``drive`` (a
-            :class:`~tpm_gym.simulation.Servo`). Omit each option that the engine does not support.
+            :class:`~tpm_gym.simulation.Servo`). The callable must not have the keyword of an
+            option that the engine does not support.
         robots: Largest number of robots in one engine; None for no limit.
 
     Raises:
@@ -352,7 +357,7 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
 
 
 def _path(engine: str | Factory) -> str:
-    """Return "module:attribute" of an engine; it shows whether two registrations are equal."""
+    """Return "module:attribute" of an engine, to compare two registrations."""
     if isinstance(engine, str):
         return engine
     return f"{engine.__module__}:{getattr(engine, '__qualname__', engine)}"

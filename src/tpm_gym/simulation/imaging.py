@@ -44,8 +44,8 @@ class Camera:
         distance: Distance from the target, m.
         yaw: Rotation about the vertical, degrees; at 0 the camera looks along +y.
         pitch: Angle above the horizon, degrees; negative to look down.
-        opening: Vertical field of view of a picture of 4:3 or wider, degrees. Narrower pictures
-            keep the horizontal field of view of 4:3.
+        opening: Vertical field of view, degrees, of a picture with an aspect ratio of 4:3 or more.
+            Narrower pictures have the horizontal field of view of a picture of 4:3.
         follows: Whether ``target`` is relative to point P of the platform.
 
     Raises:
@@ -144,8 +144,8 @@ class View(NamedTuple):
         camera: Camera, in the world frame.
         width: Width, pixels.
         height: Height, pixels.
-        segmented: Whether the picture includes the ids of bodies. The depth then has the edges of
-            these bodies; otherwise its edges may be smoothed.
+        segmented: Whether the picture includes the ids of bodies. Edges in the depth are then
+            sharp, at the same pixels as edges of the ids; otherwise they may be smoothed.
     """
 
     camera: Camera
@@ -279,7 +279,7 @@ def _rays(view: View, rows: slice, columns: slice) -> tuple[NDArray[Any], NDArra
 
 
 def tile(frames: Sequence[NDArray[Any]], columns: int | None = None) -> NDArray[Any]:
-    """Put k equal images (height, width, ...) into one image, row by row.
+    """Put k images of equal shape (height, width, ...) into one image, row by row.
 
     Args:
         frames: Images.

@@ -116,7 +116,8 @@ class Randomisation:
         joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 100. Requires
             ``drive="servo"``.
         encoder_noise: Standard deviation of each encoder reading, rad; at most 0.02. The noise of
-            a joint velocity is the difference of two such values, divided by the control period.
+            a joint velocity is the difference between the noise of two successive readings,
+            divided by the control period.
         encoder_bias: Largest bias of each encoder, rad; at most 0.001. The drive follows the
             encoder, so the true joint position has the opposite error.
         latency: Delay of the actions in control steps, at most 5.

@@ -33,9 +33,10 @@ CLOSURE_LIMIT = 0.005
 _STEPS = 10  # time steps in a control period other than 40 ms, if the settings have none
 
 _BLUR = 0.05
-"""Distance from the plane of ``mirror_axis``, as a fraction of the machine's step limit.
+"""Distance of P from the plane of symmetry normal to ``mirror_axis``, divided by the machine's
+``step_limit`` (m) along this axis.
 
-At this distance, the observed velocity normal to the plane is half the velocity from J theta_dot.
+At this distance, the observed velocity normal to the plane is half of the velocity J theta_dot.
 """
 
 _COLUMNS = (
@@ -325,13 +326,15 @@ class Simulation:
     def _mirrored(
         self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Mirror P (n, 3) m and J (n, 3, 3) of robots that are beyond the plane of ``mirror_axis``.
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the plane normal to ``mirror_axis``.
 
-        Joint positions are equal on both sides of the plane, so encoders do not show the side. The
-        sign of a passive joint shows it. A switch would measure this sign on a real robot.
+        A position of P and its mirror image have the same joint positions, so encoders do not show
+        on which side of the plane P is. The sign of a passive joint shows the side. A switch would
+        measure this sign on a real robot.
 
-        If P did not follow its path through the plane, the commands are mirrored too. This does not
-        change the joint positions on the path.
+        P may turn back at the plane although its path passes through the plane. If P and the end of
+        its path are then on different sides of the plane, the commands are mirrored too. This does
+        not change the joint positions on the path.
 
         Args:
             truth: (n, 3) m, P of the platform, world.

@@ -57,7 +57,8 @@ def boards(table: tuple[float, float], belt: Belt | None) -> list[tuple[Slab, fl
         belt: Belt of the scene.
 
     Raises:
-        ConfigurationError: If the belt begins on the table, or does not end on it.
+        ConfigurationError: If the belt's lowest x is on the table, or its highest x is not on the
+            table.
     """
     edge = table[0]
     if belt is None:

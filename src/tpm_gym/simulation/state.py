@@ -74,7 +74,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Belt:
-    """Conveyor belt: a part of the table, over its full width, whose surface moves along x.
+    """Conveyor belt: a part of the table, as wide as the table, with a surface that moves along x.
 
     ``start`` is at or beyond the edge of the table on the side of -x. The rest of the table stands
     still. A positive speed moves objects towards +x.

@@ -63,7 +63,7 @@ class CartesianControl:
         self._low, self._high = np.array(machine.region.low), np.array(machine.region.high)
 
     def command(self, actions: FloatArray, current: FloatArray) -> FloatArray:
-        """Add the increments, and project into the region."""
+        """Add the increments to the commands, and project the sum into the region."""
         plain = np.ascontiguousarray
         commands: FloatArray = loops().shifted(
             plain(current), plain(actions), self._step, self._low, self._high
@@ -89,10 +89,11 @@ class CartesianControl:
 
 
 class JointControl:
-    """Control whose actions are increments of the three joints, in units of the joint limit.
+    """Control whose actions are increments of the three joints.
 
-    The increment is scaled down as a whole if it would move P farther than the step limit, or into
-    a posture that cannot be assembled. (This is frequent along y, where small turns of the joints
+    An action of 1 moves a joint by the machine's ``joint_limit``, scaled to the control period. The
+    increment is scaled down as a whole if it would move P farther than the step limit, or into a
+    posture that cannot be assembled. (This is frequent along y, where small turns of the joints
     move the platform far.) A command beyond the region is projected into it.
     """
 
@@ -122,7 +123,7 @@ class JointControl:
     def _tried(
         self, current: FloatArray, theta: FloatArray, step: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return P (r, 3) m after a share (r,) of the increment, and its displacement (r,).
+        """Return P (r, 3) m after a share (r,) of the increment, and P's displacement (r,).
 
         The displacement is the largest one of x, y and z, in units of the step limit. It is
         infinite where the machine cannot be assembled in its modes.
@@ -142,9 +143,9 @@ class JointControl:
         """Shorten the increment so that P moves by almost the step limit; return P (r, 3) m.
 
         ``excess`` is the displacement at ``share``. The secant through two tries gives the next
-        try. (Dividing by the excess alone converges slowly next to the serial singularity, where P
-        slows down along the way.) Next to a parallel singularity no try may be within the limit; P
-        stays where it is then.
+        try. (Dividing ``share`` by the displacement alone converges slowly next to the serial
+        singularity, where the displacement is not proportional to the share.) Next to a parallel
+        singularity, it can happen that all tries exceed the limit; P then stays where it is.
         """
         point, low, high = current, np.zeros_like(share), share
         before, was = np.zeros_like(share), np.zeros_like(share)
@@ -178,7 +179,7 @@ class JointControl:
         return float(max(turns / self._turn, axes))
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide the joints by their limit."""
+        """Divide the joint positions by the joint limit."""
         places: FloatArray = self._machine.inverse(points) / self._turn
         return places
 
@@ -190,11 +191,11 @@ class JointControl:
 
 
 class Follower:
-    """Limit of commands to motions that the motors can follow, by closed-form dynamics.
+    """Limiter of commands, so that the motors can follow them; it uses closed-form dynamics.
 
-    A step is the difference of two successive commands. Its change from the last step is limited
-    along each axis. The step itself is limited so that P can stop at an end of the region. Then the
-    change is scaled down as a whole until the nominal machine needs at most the share
+    A step is the difference of two successive commands. The change from one step to the next is
+    limited along each axis. The step itself is limited so that P can stop at an end of the region.
+    Then the change is scaled down as a whole until the nominal machine needs at most the share
     :data:`USABLE` of its motors' peak torques.
 
     Args:
@@ -246,7 +247,11 @@ class Follower:
         return enough
 
     def _torques(self, before: FloatArray, current: FloatArray, then: FloatArray) -> FloatArray:
-        """Return the torques (k, n, 3) N m on the splines to each of k next commands (k, n, 3)."""
+        """Return the torques (k, n, 3) N m in the middle of the path of three commands.
+
+        ``before`` and ``current`` (n, 3) m are the first two commands. ``then`` (k, n, 3) m has k
+        alternatives for the third command.
+        """
         middle = (before + 6 * current + then) / 8
         ends = np.broadcast_to((before + current) / 2, then.shape), (current + then) / 2
         first, now, last = self._machine.inverse(np.stack([ends[0], middle, ends[1]]))

@@ -27,12 +27,12 @@ LATEST: Final = 1.0
 SHARE: Final = 0.55
 """Share of the machine's region along x that is over the belt."""
 EDGE: Final = 0.030
-"""Distance of goals from the end of the belt, m."""
+"""Smallest distance of goals from the end of the belt, m."""
 CLEARANCE: Final = 0.028
-"""Height over the block, at its start and its goal, at which the expert arrives and leaves, m."""
+"""Height over start and goal from which the cup comes down, and to which it goes up again, m."""
 UP: Final = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
 SEALING: Final = 4
-"""Number of control steps in which the cup follows the block until it has sealed."""
+"""Largest number of control steps for which the cup follows the block until the cup seals."""
 GAP: Final = 0.010
 """Distance of the tray from the end of the belt, m."""
 TRAY_COLOUR: Final = (0.45, 0.62, 0.80, 1.0)
@@ -45,8 +45,8 @@ class Conveyor(Task):
     The belt runs along x, at 0.05 to 0.20 m/s, drawn for each episode. The block comes within reach
     in the first second. The camera shows it 3 control steps late, in the observation and in the
     achieved goal. The goal lies in the tray, on the table beyond the belt. With
-    ``goals="tempting"``, a part of the block's way on the belt is only just safe, and so is a part
-    of the line along x through the goal in the tray.
+    ``goals="tempting"``, the conditioning is just above the safe threshold on a part of the block's
+    way on the belt, and on a part of the line along x through the goal in the tray.
     """
 
     block = Block()
@@ -95,7 +95,7 @@ class Conveyor(Task):
         return ends.min(axis=0), ends.max(axis=0)
 
     def _draw(self, first: float, last: float, rng: np.random.Generator) -> FloatArray:
-        """Draw a place (3,) m between two values of x; the whole line between them is safe."""
+        """Draw a place (3,) m on a safe line along x that extends from ``first`` to ``last``."""
         low, high = self._floor
 
         def draw(rng: np.random.Generator) -> FloatArray:
@@ -202,7 +202,7 @@ class _Camera:
         return self.motion.machine.mount.rotate(way)
 
     def place(self) -> FloatArray:
-        """Return the block's present centre (3,) m, world: in the picture plus the belt's way."""
+        """Return the block's present centre (3,) m, world: as seen, plus the motion since then."""
         steps = len(self._trail) - 1
         if self._seen("velocity")[0] > self.motion.seen["belt_speed"][0] / 2:
             steps = self._task.camera_delay
@@ -210,7 +210,7 @@ class _Camera:
         return self._seen("position") + steps * way
 
     def above(self, height: float) -> FloatArray:
-        """Return the command (3,) m with which the lip is above the block at the step's end.
+        """Return the command (3,) m for the lip to be ``height`` m over the block after the step.
 
         P lags the command by half a control period.
         """

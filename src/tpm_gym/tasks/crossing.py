@@ -19,17 +19,17 @@ from tpm_gym.tasks.task import Task
 __all__ = ["Crossing"]
 
 STRIPE: Final = 0.003
-"""Half width of the stripe that shows the plane on the table, m."""
+"""Half width of the stripe on the table that shows the plane y = 0, m."""
 
 
 class Crossing(Task):
     """Bring point P to a goal on the other side of y = 0, and stop there.
 
-    In the plane y = 0, a parallel singularity, no torque of the motors acts along y, and no way
-    leads around the plane. So P has to pass it by inertia. The torques stay finite only if the
+    In the plane y = 0, a parallel singularity, no torque of the motors acts along y, and P cannot
+    go around the plane. So P has to pass the plane by inertia. The torques stay finite only if the
     velocity along y is constant there. The mechanism changes its assembly mode, which does not end
-    the episode. With too little speed, or an acceleration, P turns back; the command is then
-    mirrored to the side of P.
+    the episode. If P is too slow, or if commands accelerate it along y in the plane, P turns back;
+    the command is then mirrored to the side of P.
 
     P starts at home. Goals are the mirror images of those of Reach. Only Cartesian control can name
     a side: joint positions are equal on both sides.
@@ -59,7 +59,7 @@ class Crossing(Task):
         return {"goal": machine.mount.to_world(points)}
 
     def crossed(self, state: State) -> BoolArray:
-        """Return whether P is on the other side of the plane than home, (n,)."""
+        """Return whether P and home are on different sides of the plane, (n,)."""
         there = self.machine.mount.to_paper(state.fk_position)[:, self._axis]
         beyond: BoolArray = there * self.machine.home[self._axis] < 0
         return beyond

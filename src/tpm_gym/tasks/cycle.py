@@ -23,11 +23,11 @@ __all__ = ["Cycle"]
 
 STROKE: Final = 0.305
 RISE: Final = 0.025
-"""Lengths of the way: along x (STROKE), and up and down at its ends (RISE), m."""
+"""Lengths of the way of P: along x (STROKE), and up and down at both ends (RISE), m."""
 BLEND: Final = 0.050
 """Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
 
-Its curvature is zero at both ends, so that the acceleration does not jump.
+The curvature is zero at both ends of a corner, so that the acceleration does not jump.
 """
 SPEED: Final = 5.0
 """Largest speed of the command along x and z, m/s; the motors turn at up to 20 rad/s there."""
@@ -36,17 +36,17 @@ PAYLOAD: Final = 0.1
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
 """Largest RMS torque of the plan, as a share of the peak torque; 2% are a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Accelerations along x, y, z, divided by the acceleration at peak torque along one axis alone."""
+"""Acceleration limits (x, y, z), as shares of P's largest acceleration along that axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
-The way ends close to the end of the region along x, but far from the end of the region along z. The
-motors must be able to brake along x and z at the same time.
+Along x, the way ends close to the end of the region; along z, far from it. The motors must be able
+to brake along x and z at the same time.
 """
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth of P below the gate at which the reward term is -1 in each step, m."""
+"""Depth of P below the gate, minus the tolerance, at which the reward term is -1, m."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""
@@ -56,16 +56,16 @@ _DRAWS: Final = 1000
 class Cycle(Task):
     """Carry a payload 25 mm up, 305 mm across and 25 mm down, as fast as the motors can.
 
-    This is one half of the cycle by which industry compares pick-and-place robots; the other half
-    leads back. P starts at rest at one end and has to stop at the other end, within 2 mm. The
-    direction and the depth y of the way are drawn for each episode. Both corners of the gate
-    between the ends are rounded over 50 mm. The reward has a term for every step in which P is more
-    than 2 mm below the gate.
+    This way is one half of the cycle by which industry compares pick-and-place robots; the other
+    half leads back. P starts at rest at one end and has to stop at the other end, within 2 mm. The
+    direction and the y of the way are drawn for each episode. The way has the shape of a gate, with
+    corners that are rounded over 50 mm. The reward has a term for every step in which P is more
+    than 2 mm below this gate.
 
-    Actions come every 4 ms, and the limits are the motors': the command moves at up to 5 m/s, and
-    closed-form dynamics shorten a change of its speed that would need more than 95% of the peak
-    torque. A gripper holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could
-    not: it holds 12 N, and 0.1 kg needs up to 15 N here.
+    Actions come every 4 ms. The command moves at up to 5 m/s. If a change of its velocity would
+    need more than 95% of the peak torque by closed-form dynamics, the change is reduced. A gripper
+    holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could not: it holds 12 N,
+    and 0.1 kg needs up to 15 N here.
     """
 
     scene = Scene(markers=POINTS // SHOWN + 1, marker_radius=0.004)
@@ -117,7 +117,7 @@ class Cycle(Task):
     # -- the way ------------------------------------------------------------------------------
 
     def _height(self, way: FloatArray) -> FloatArray:
-        """Return the height of the gate, m, at ``way`` (...,) m from an end."""
+        """Return the height of the gate, m, at distances ``way`` (...,) m from an end along x."""
         to_end = np.minimum(way, STROKE - way)
         share = np.clip(1 - to_end / BLEND, 0.0, 1.0)
         height: FloatArray = np.where(to_end < 0, 0.0, RISE * np.cbrt(1 - share**3))
@@ -152,7 +152,7 @@ class Cycle(Task):
         return {"goal": np.array(goals), **chosen}
 
     def _draw(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a goal (3,) m: an end, and a depth at which the whole way is safe."""
+        """Draw a goal (3,) m: one end of the way, with a y at which the whole way is safe."""
         low, high = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
 
         def draw(rng: np.random.Generator) -> FloatArray:
@@ -171,7 +171,7 @@ class Cycle(Task):
         return goal
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return a box for each end, low and high corner (3,) m, world; it spans all depths."""
+        """Return the box of goals at each end, as low and high corner (3,) m, world, over all y."""
         del block
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []
@@ -187,12 +187,12 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the base class's term; if dense, subtract the gap over 10 mm, at most 1."""
+        """Return the base class's term, minus min(gap / 10 mm, 1) if the reward is dense."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus the depth of P below the gate beyond the tolerance, in units of 5 mm."""
+        """Return -(d - tolerance) / 5 mm, at most 0; d is the depth of P below the gate."""
         points = self.machine.mount.to_paper(state.fk_position)
         height = self._height(points[:, 0] - self._ends[0])
         below = height - (self._level - points[:, 2]) - self.tolerance

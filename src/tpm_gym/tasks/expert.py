@@ -2,7 +2,7 @@
 
 The expert gets the same observation as a policy. For each robot it follows the task's plan, which
 moves point P with trapezoidal speed, and converts each command into an action of the environment's
-control. Between two safe points its plan stays safe: y, on which the conditioning depends, changes
+control. A move between two safe points stays safe: y, on which the conditioning depends, changes
 monotonically along with x and z.
 """
 
@@ -28,12 +28,12 @@ class Expert:
     Call :meth:`act` with each observation. A new episode starts a new plan.
 
     Args:
-        env: A :class:`~tpm_gym.TPMEnv`, wrapped or not, or a :class:`~tpm_gym.TPMVectorEnv`. Its
-            task, control, latency and count of episodes are used, and nothing else.
+        env: A :class:`~tpm_gym.TPMEnv`, wrapped or not, or a :class:`~tpm_gym.TPMVectorEnv`. The
+            expert reads its task, control, latency and count of episodes, and nothing else.
 
     Raises:
         InputError: If ``env`` is no such environment.
-        ConfigurationError: If its task has no plan; :meth:`reset` and :meth:`act` raise this.
+        ConfigurationError: If the task has no plan; :meth:`reset` and :meth:`act` raise this.
     """
 
     def __init__(self, env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> None:
@@ -59,7 +59,7 @@ class Expert:
 
         Raises:
             EpisodeError: If no episode is running, or a plan has no moves.
-            ConfigurationError: If a plan needs a vacuum, or an entry, that the task lacks.
+            ConfigurationError: If a plan needs the vacuum or an entry that the task lacks.
         """
         _ = self._env.state  # raises without an episode
         self._look(observation)

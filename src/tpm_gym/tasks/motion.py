@@ -69,14 +69,14 @@ class Motion:
 
     @property
     def command(self) -> FloatArray:
-        """Command for P after all delayed actions, machine's frame, m."""
+        """Command for P after all actions that latency holds back, machine's frame, m."""
         command = self.machine.mount.to_paper(self.seen["position"] + self.seen["command"])
         for action in self.under_way:
             command = self._control.command(action[None], command[None])[0]
         return command
 
     def holding(self, name: str | None = None) -> bool:
-        """Return whether the cup holds the object of that name, by default the only object.
+        """Return whether the cup holds the object ``name``; None for the only object.
 
         Raises:
             ConfigurationError: If the task does not observe the object, or has several and ``name``
@@ -85,10 +85,10 @@ class Motion:
         return bool(self._see(name, "held")[0] > 0.5)
 
     def carried_to(self, place: FloatArray, name: str | None = None) -> FloatArray:
-        """Return P (3,) m, machine's frame, for the held object's centre to be at ``place``.
+        """Return the position (3,) m of P, machine's frame, that puts the held object at ``place``.
 
-        ``place`` is (3,) m, world frame. The cup does not hold an object exactly at its middle.
-        Name and errors are as in :meth:`holding`.
+        ``place`` is the goal of the object's centre, (3,) m, world frame. The object's centre is
+        not exactly below the cup's centre. Name and errors are as in :meth:`holding`.
         """
         grip = self.seen["position"] - self._see(name, "position")
         return self.machine.mount.to_paper(place + grip)
@@ -135,7 +135,7 @@ class Motion:
         Args:
             target: Function that returns the command (3,) m that would meet the target at the end
                 of this control step, machine's frame.
-            step: Way (3,) m of the target in a control step.
+            step: Displacement (3,) m of the target in a control step.
             above: Vector (3,) m from the target to the place from which P comes down.
         """
         start, place = self.command, target()
@@ -147,10 +147,13 @@ class Motion:
             yield Move(target() + (1 - down) * above - (1 - done) * way, bool(down > 0))
 
     def _overlapped(self, ways: list[FloatArray]) -> FloatArray:
-        """Return the done fraction of each of k ways after each of n control steps, (n, k).
+        """Return the fractions (n, k) of k ways that P has covered after each of n control steps.
 
-        Each way begins while the way before it slows down. The sum of the speeds of these two ways
-        does not exceed the largest speed of one way.
+        P follows the ways one after the other. Each way begins while the way before it slows down.
+        The sum of the speeds of these two ways does not exceed the largest speed of one way.
+
+        Args:
+            ways: For each way, the covered fractions by :meth:`trapezoid`.
         """
         lengths = np.array([len(way) for way in ways])
         begins = np.cumsum([0, *np.maximum(lengths[:-1] - self._ramp + 1, 0)])
@@ -168,7 +171,7 @@ class Motion:
             block: The block.
             clearance: Height over the block from where P comes down, m.
             gently: Whether P stops above the block, and then comes down slowly until the cup seals.
-                Otherwise it presses the block on the table.
+                Otherwise the cup presses the block on the table.
 
         Raises:
             ConfigurationError: If the task does not observe the block.
@@ -189,7 +192,7 @@ class Motion:
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:
-        """Return fractions of the way at the control steps from ``start`` to ``stop``.
+        """Return the fractions (n,) of the way from ``start`` to ``stop`` after each control step.
 
         Speed rises over RAMP, holds, and falls. Neither P nor a controlled joint exceeds its
         limit. Rounding of the observation (float32) does not add a step.

@@ -17,9 +17,9 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.028
-"""Height over the block, at its start and its goal, at which the expert arrives and leaves, m.
+"""Height over start and goal from which the cup comes down, and to which it goes up again, m.
 
-It is no multiple of the tolerance, so that rounding errors do not decide about success.
+The height is no multiple of the tolerance, so that rounding errors do not decide about success.
 """
 RELEASE_HEIGHT = 0.0005
 """Height over a goal on the table, m, to which the expert carries the block to release it.
@@ -31,7 +31,7 @@ A block that is pressed on the table has forces of friction that each engine com
 
 
 class PickAndPlace(Task):
-    """Pick up a block with the vacuum cup and bring its centre to the goal.
+    """Pick up a block with the vacuum cup and bring the block's centre to the goal.
 
     Half of the goals lie on the table, half in the air, away from the start of the block. Goals and
     starts lie where the machine is safe.

@@ -19,7 +19,7 @@ from tpm_gym.tasks.task import Entry, Task, dense
 __all__ = ["Push"]
 
 CLEARANCE: Final = 0.008
-"""Height of the lip over the block on arrival; gap from lip to face as the lip comes down, m."""
+"""Height of the arriving lip over the block's top; then its distance from the pushed face, m."""
 SHORTEST: Final = 0.060
 LONGEST: Final = 0.240
 """Bounds (SHORTEST, LONGEST) of the block's displacement along the pushed face's normal, m."""
@@ -41,9 +41,9 @@ _DRAWS: Final = 8
 class Push(Task):
     """Shove a block over the table with the lip of the cup to the goal; the vacuum stays off.
 
-    The block has to move nearly square to one of its faces, by 60 to 240 mm. The robot can reach
-    the place behind that face. The workspace of the paper's machine is thin in y, so that the block
-    moves along x there.
+    The block has to move by 60 to 240 mm, nearly along the normal of the pushed face. The robot can
+    reach the place behind the block. The workspace of the paper's machine is thin in y, so with
+    this machine the block moves along x.
     """
 
     block = Block(height=0.040)
@@ -76,7 +76,7 @@ class Push(Task):
         raise ConfigurationError("goal_region", self.machine.goal_region, valid)
 
     def _draw(self, rng: np.random.Generator) -> FloatArray:
-        """Draw pairs of start and goal (k, 2, 3) m, as points P in the machine's frame."""
+        """Draw pairs of start and goal (k, 2, 3) m, as positions of P in the machine's frame."""
         table = self.on_table(self.block)
         if self.goals == "tempting":
             points = sampling.at_threshold(rng, self.machine, table, 2 * _DRAWS)
@@ -84,7 +84,7 @@ class Push(Task):
         return rng.uniform(table.low, table.high, (_DRAWS, 2, 3))
 
     def _can_push(self, ways: FloatArray) -> BoolArray:
-        """Return whether the robot can push blocks from start to goal, (..., 2, 3) m, as (...,)."""
+        """Return whether a push is possible, (...,), for pairs of start and goal (..., 2, 3) m."""
         machine, along = self.machine, np.diff(ways, axis=-2)
         across, distance = np.moveaxis(np.sort(np.abs(along[..., 0, :2])), -1, 0)
         square = (distance >= SHORTEST) & (distance <= LONGEST) & (across <= SLOPE * distance)
@@ -110,7 +110,7 @@ class Push(Task):
         return point
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of the block, which turns when pushed."""
+        """Return the entries of the robot, then those of the block, which include its rotation."""
         return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:

@@ -1,4 +1,4 @@
-"""Tasks by their names in options."""
+"""Registry of tasks, and their names in options."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -
 
     Args:
         task: Name, class or task.
-        machine: The machine; None for the paper's.
+        machine: The machine; None for the paper's machine.
         options: Options of :class:`Task`; None keeps a default.
 
     Raises:

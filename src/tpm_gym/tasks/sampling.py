@@ -1,12 +1,13 @@
-"""Sampling of goals and starts: safe ones, and tempting ones.
+"""Sampling of goals and starts: safe ones, and tempting ones, which are next to the singularity.
 
-A careless policy that moves to a tempting goal comes too near to the singularity. Straight lines of
-P between safe points are safe (the safe set is convex; a test draws pairs). So with Cartesian
-actions the risk is at the ends: the goal and an object's start are just above the threshold, and
-nearly half of the sphere around the goal is unsafe. With joint actions the risk is on the way too:
-the line in joint space from start to goal is unsafe, often all the way. Every tempting pair of
-start and goal has both risks, so that environments with Cartesian actions and with joint actions
-have the same goals.
+A careless policy that moves to a tempting goal comes too near to the singularity. If two positions
+of P are safe, all positions on the straight line between them are safe (the safe set is convex; a
+test checks random pairs). So with Cartesian actions, the risk is at the ends of the line. The goal
+and an object's start are just above the threshold of safe conditioning, and nearly half of the
+positions within the tolerance of the goal are unsafe. With joint actions, the motion between the
+ends is a risk too. The line in joint space from start to goal is partly unsafe, and often unsafe
+everywhere except next to its ends. Every tempting pair of start and goal has both risks, so that
+environments with Cartesian actions and with joint actions have the same goals.
 
 All points are positions of P, in the machine's frame, m. Every function takes one generator for
 each row, and a row draws from its own generator only.
@@ -40,9 +41,9 @@ __all__ = [
 APART: Final = 0.030
 """Smallest distance from start to goal, m, so that no episode starts with success."""
 BAND: Final = 0.004
-"""Largest excess of a tempting end's conditioning over the threshold.
+"""Largest difference between the conditioning of a tempting start or goal and the threshold.
 
-Along y, this excess is a distance of less than 1 mm.
+On the paper's machine, a displacement of about 1 mm along y changes the conditioning by as much.
 """
 
 _DRAWS: Final = 4  # points in a call; nearly every row then needs only one call
@@ -110,15 +111,16 @@ def safe_draw(
     draw: Callable[[np.random.Generator], FloatArray],
     ways: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Draw points until one has a safe way; return this point, (3,).
+    """Draw points until the way of P that belongs to a point is safe; return this point, (3,).
 
     Args:
         rng: Generator of the row.
         machine: The machine.
-        goals: ``"tempting"`` if a part of the way shall be only just safe.
+        goals: ``"tempting"`` if the lowest conditioning on the way must be just above the threshold
+            of safe conditioning.
         draw: Function that draws d points (d, 3).
-        ways: Function of these points. It returns the ends (d, k, 3) m, machine's frame, of the
-            straight parts of their ways.
+        ways: Function from points (d, 3) to the corners (d, k, 3) m, machine's frame, of the way of
+            each point. Ways are straight between their corners.
 
     Raises:
         ConfigurationError: If no draw has such a way.
@@ -153,7 +155,10 @@ def tempting(
     start: Region | Vector,
     goals: Sequence[Region],
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw tempting pairs of starts and goals, (r, 3) each.
+    """Draw tempting starts and goals in pairs, (r, 3) each.
+
+    The goal, and a start that is drawn, are just above the threshold of safe conditioning. A part
+    of the line in joint space between them is below the threshold.
 
     Args:
         rngs: One for each row.
@@ -162,7 +167,7 @@ def tempting(
         goals: Equally likely regions of the goals.
 
     Raises:
-        ConfigurationError: If no pair was found; not every machine has tempting pairs.
+        ConfigurationError: If no pair was found; not every machine has such pairs.
     """
     pairs = np.array([_tempting(rng, machine, start, goals) for rng in rngs])
     return pairs[:, 0], pairs[:, 1]
@@ -174,7 +179,7 @@ def _tempting(
     start: Region | Vector,
     goals: Sequence[Region],
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw one tempting pair, (3,) each."""
+    """Draw one pair of start and goal, (3,) each, for :func:`tempting`."""
     for _ in range(_ATTEMPTS):
         ends = _at_the_threshold(rng, machine, goals[int(rng.integers(len(goals)))])  # (n, 3)
         starts = (

@@ -17,21 +17,21 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["Stack"]
 
 CLEARANCE: Final = 0.045
-"""Height over a block, or over its place, at which the expert arrives and leaves, m.
+"""Height over start and goal from which the cup comes down, and to which it goes up again, m.
 
-A carried block passes above a standing block.
+At this height, a carried block passes above a standing block.
 """
 APART: Final = 0.045
-"""Smallest distance between the middles of blocks and goal on the table, m."""
+"""Smallest distance between the centres of the blocks and of the goal on the table, m."""
 CLEAR: Final = 0.0005
-"""Smallest distance of two blocks corner to corner, m."""
+"""Smallest distance between the corners of two blocks, m."""
 
 
 class Stack(Task):
     """Put the red block on the goal, and the blue block on top of it.
 
     The goal has six numbers: the centre of the lower block, then that of the upper block. The
-    block that is farther from its place decides about success.
+    block that is farther from its goal decides about success.
     """
 
     lower = Block("lower")

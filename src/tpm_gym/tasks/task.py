@@ -4,7 +4,7 @@ A task sees only :class:`~tpm_gym.simulation.state.State`, whose first axis is t
 positions and velocities are in the world frame, in metres and seconds.
 
 A new task is one file: derive from :class:`Task`, write :meth:`~Task.sample` and, for an expert,
-:meth:`~Task.plan`; then :func:`tpm_gym.register_task`.
+:meth:`~Task.plan`; then call :func:`tpm_gym.register_task`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Entry:
     """One quantity in the observation vector, stored as (value - centre) / scale.
 
     Attributes:
-        name: Its name.
+        name: Name of the entry.
         unit: Unit of the value before scaling.
         meaning: Description, with the sensor.
         centre: Value that is stored as 0.
@@ -83,10 +83,10 @@ class Task(ABC):
         samplings: Values of ``goals``.
         controls: Names of the controls that can perform the task.
         events: Names of methods of the task that return (n,) bool for a state. ``info`` has the
-            results. An evaluation reports the share of episodes in which each was ever true.
+            results. An evaluation reports the share of episodes in which each event occurred.
         control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
-            scaled to this time. In shorter periods commands can ask for more torque than the motors
-            have, unless :attr:`accelerations` are set; a shield requires them then.
+            scaled to this time. For a shorter time, set :attr:`accelerations`: without it, the
+            commands can need more torque than the motors have, and shields cannot be used.
         accelerations: Limits of the command's acceleration, and of its deceleration before the
             ends of the region, along x, y, z, machine's frame, m/s^2; None for no limits.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
@@ -191,7 +191,7 @@ class Task(ABC):
         """
 
     def achieved(self, state: State) -> FloatArray:
-        """Return the achieved goal, (n, goal_size) m: the objects' centres, or P without objects.
+        """Return the achieved goal, (n, goal_size) m: the objects' centres; P if there are none.
 
         P is computed by forward kinematics from the encoder readings.
         """
@@ -199,7 +199,7 @@ class Task(ABC):
         return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Yield the expert's moves for one robot; after the last move, the expert repeats it.
+        """Yield the expert's moves for one robot; the expert repeats the last move.
 
         Raises:
             ConfigurationError: If the task has no plan.
@@ -217,7 +217,7 @@ class Task(ABC):
         return (*self.robot_entries(), *chain(*objects))
 
     def departures(self, goals: FloatArray) -> FloatArray | None:
-        """Return where P starts in episodes with ``goals`` (r, goal_size) m, world.
+        """Return the starts of P in episodes with ``goals`` (r, goal_size) m, world.
 
         Returns:
             (r, 3) m, machine's frame; None for the machine's home.
@@ -241,7 +241,7 @@ class Task(ABC):
         return {"goal": goal, "singularity": singularity, **self.shaping(state)}
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the reward's goal term, (...,), for a gap (...,) m; if sparse, NaN gives -1."""
+        """Return the goal term (...,) for a gap (...,) m; in a sparse reward, NaN gives -1."""
         if self.reward == "sparse":
             missed: FloatArray = np.subtract(gap < self.tolerance, 1.0)
             return missed
@@ -250,11 +250,11 @@ class Task(ABC):
     def penalty(self, state: State) -> FloatArray:
         """Return the singularity penalty before weighting, (n,) in [0, 1].
 
-        It is 1 - (c / safe)^4 for a conditioning c below the machine's ``safe_conditioning``, else
-        0, and 1 past a singularity. It is steepest at the threshold, so that crossing the threshold
-        has a price. Policies ignored a cubic step, which is flat at both ends: SAC with joint
-        increments, on goals next to the threshold, spent 24% of the time below it without a
-        penalty, 19% with the cubic step, 1% with this penalty.
+        It is 1 past a singularity. Else it is 1 - (c / safe)^4 where the conditioning c is below
+        ``safe``, the machine's ``safe_conditioning``, and 0 elsewhere. It is steepest at ``safe``.
+        Policies ignored an earlier penalty, a cubic function of c with slope 0 at ``safe``. SAC
+        with joint increments, on goals next to the threshold ``safe``, spent 24% of the time below
+        it without a penalty, 19% with the cubic penalty, 1% with this penalty.
         """
         values: FloatArray = loops().singularity_penalty(
             state.conditioning,
@@ -358,8 +358,8 @@ class Task(ABC):
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the low and high corners (3,) m of the places where a block may start.
 
-        By default the robot can reach them all. A task whose blocks come from elsewhere overrides
-        this.
+        By default, these are all places that the robot can reach. A task with blocks that come from
+        elsewhere overrides this method.
         """
         return self.reach_of(block)
 
@@ -367,10 +367,10 @@ class Task(ABC):
         """Return the boxes in which goals lie, as low and high corners (3,) m each.
 
         By default there is one box: the reach of point P, or of a block in the cup. A task with
-        goals elsewhere overrides this.
+        goals elsewhere overrides this method.
 
         Args:
-            block: The block whose goals they are; None for goals of point P.
+            block: Block that has to reach the goals; None for goals of point P.
         """
         return [self.reach_of(block)]
 
@@ -395,7 +395,7 @@ class Task(ABC):
         return low, high
 
     def on_table(self, block: Block) -> Region:
-        """Return the goals for point P, machine's frame, with a block in the cup on the table."""
+        """Return the goal region of P, machine's frame, at which a held block is on the table."""
         low, high = self.machine.goal_region.low, self.machine.goal_region.high
         touching = hanging(block) + (0.0, 0.0, block.height / 2)
         level = float(self.machine.mount.to_paper(touching)[2])
@@ -422,7 +422,7 @@ class Task(ABC):
     # -- observation ------------------------------------------------------------------------------
 
     def robot_entries(self) -> tuple[Entry, ...]:
-        """Return the entries that encoders and forward kinematics measure."""
+        """Return the entries of the robot, from encoders and forward kinematics."""
         centre, extent, speed, step = self._scales()
         measure = self._measure
         return (
@@ -434,12 +434,12 @@ class Task(ABC):
         )  # fmt: skip
 
     def object_entries(self, index: int = 0, turn: bool = False) -> tuple[Entry, ...]:
-        """Return the entries that a camera and the vacuum gauge measure of one object.
+        """Return the entries of one object, from a camera and the vacuum gauge.
 
         Args:
             index: Number of the object in the scene.
-            turn: Whether its rotation about the vertical is measured. Four times the angle has one
-                value for the four orientations in which a block with a square base looks the same.
+            turn: Whether its rotation about the vertical is measured, as four times the angle. This
+                value is equal for the four orientations in which a square block looks the same.
         """
         centre, extent, speed, _ = self._scales()
         name, near = self.scene.objects[index].name, tuple(min(0.1, max(0.02, e)) for e in extent)
@@ -473,7 +473,7 @@ class Task(ABC):
         return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
-        """Return centre and size of the region (m, world), full speed (m/s), largest step (m)."""
+        """Return the region's centre and half size (m, world), full speed (m/s), full step (m)."""
         region, mount = self.machine.region, self.machine.mount
         step = np.multiply(self.machine.step_limit, self.control_period / CONTROL_PERIOD)
         low, high = np.array(region.low), np.array(region.high)
@@ -537,7 +537,7 @@ class Task(ABC):
         return goal.reshape(-1, 3)
 
     def _not_lost(self) -> tuple[FloatArray, FloatArray]:
-        """Return the corners (k, 3) m of the box outside which each object is lost."""
+        """Return the corners (k, 3) m of k boxes: an object is lost outside of its box."""
         low, high = np.empty((2, len(self.scene.objects), 3))
         for index, block in enumerate(self.scene.objects):
             places = self._place_of(block), self.starts_of(block), *self.goals_of(block)
@@ -564,7 +564,7 @@ def _turn(index: int, state: State) -> FloatArray:
 
 
 def _columns(entries: Sequence[Entry]) -> Any:
-    """Return an index of the columns of entries that share a source."""
+    """Return the index that selects the columns of entries from the array of their source."""
     if entries[0].columns is None:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]
@@ -577,6 +577,6 @@ def _range(low: ArrayLike, high: ArrayLike) -> str:
 
 
 def _boxes(points: FloatArray, block: Block) -> tuple[FloatArray, FloatArray]:
-    """Return low and high corners (r, 3) m of upright blocks, 1 um smaller: blocks may touch."""
-    half = np.array(block.half) - 1e-6
+    """Return low and high corners (r, 3) m of upright blocks, each 1 um inside the block."""
+    half = np.array(block.half) - 1e-6  # blocks may touch
     return points - half, points + half

@@ -1,4 +1,4 @@
-"""Throw: let a block go in flight, so that it slides to rest at a goal outside the workspace."""
+"""Throw: release a block in motion, so that it slides to rest at a goal outside the workspace."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ FARTHEST: Final = 0.150
 CLEARANCE: Final = 0.028
 """Height of the cup over the block before and after the expert picks it, m."""
 DROP: Final = 0.003
-"""Height over the table at which the block is let go, m; low, so that it does not tumble."""
+"""Height over the table at which the block is let go, m; low, so that the block does not tumble."""
 BRAKING: Final = 0.050
-"""Distance from the place of release to the end of the region, within which P stops, m."""
+"""Distance from the place of release to the end of the region, m; P stops within this distance."""
 RUN_UP: Final = (1 / 3, 2 / 3, 1.0, 1.0, 1.0)
 """Lengths of the command's steps in the run-up, as shares of the last step.
 
@@ -35,25 +35,25 @@ The last step switches the vacuum off. The path is a spline of three commands, s
 equal steps the speed is constant in the last two control periods, until the cup lets go.
 """
 VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / Task.control_period
-"""Time from the command to let go until the block is free, in control periods."""
+"""Number of control periods from switching the vacuum off until the block is free."""
 AHEAD: Final = 1.5 - VENTED
 """Distance from the place of release to the last command of the run-up, in units of the last step.
 
 The spline lags the commands by half a period.
 """
-_RUN_UP_WAY: Final = sum(RUN_UP) - AHEAD  # from its start to the release, in units of its last step
+_RUN_UP_WAY: Final = sum(RUN_UP) - AHEAD  # from the start to the release, in units of the last step
 _BRAKING_WAY: Final = AHEAD + sum(RUN_UP[:2])  # from the release to the stop
 _DRAWS: Final = 256
 
 
 class Throw(Task):
-    """Pick up a block and let it go in flight, so that it slides to the goal and stops there.
+    """Pick up a block and release it in motion, so that it slides to the goal and stops there.
 
     The goals lie on the table outside the workspace, 40 to 150 mm beyond either end of the
-    machine's region along x, as far as its table and its speed allow. The block is slippery: at a
-    speed v it slides v^2 / (2 mu g), with mu = 0.1 against the table. The goal is achieved if the
-    centre of the block is within 20 mm of it. With ``goals="tempting"``, the path on which P runs
-    up, lets go and stops is only just safe.
+    machine's region along x, as far as the table and the speed of the machine allow. The block is
+    slippery: at a speed v it slides by v^2 / (2 mu g), with mu = 0.1 against the table. The goal is
+    achieved if the block's centre is within 20 mm of it. With ``goals="tempting"``, the lowest
+    conditioning from the run-up to the stop of P is just above the safe threshold.
     """
 
     block = Block(friction=0.1)
@@ -77,7 +77,7 @@ class Throw(Task):
         return starts
 
     def _draw_goal(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a goal (3,) m for which the way of P with the block is safe."""
+        """Draw a goal (3,) m for which P stays safe from the run-up to the stop."""
         boxes, table = self.goals_of(self.block), self.on_table(self.block)
         ends = np.stack([self.machine.mount.to_world(end) for end in (table.low, table.high)])
 
@@ -92,7 +92,7 @@ class Throw(Task):
         """Return the boxes beyond both ends of the region into which the robot can throw.
 
         Raises:
-            ConfigurationError: If there is none.
+            ConfigurationError: If there is no such box.
         """
         low, high = self.reach_of(block)
         longest = min(self.machine.step_limit[0], (high[0] - low[0] - BRAKING) / _RUN_UP_WAY)
@@ -118,10 +118,10 @@ class Throw(Task):
         return boxes
 
     def _release(self, goal: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return where the block is let go, (..., 3) m, and the way along x in one step, (...,) m.
+        """Return the place (..., 3) m of the release, and the run-up's last step along x (...,) m.
 
         A block that falls by h meets the table with the impulse m sqrt(2 g h), and friction takes
-        mu sqrt(2 g h) away from the speed v. Fall and slide together are v^2 / (2 mu g) + mu h.
+        mu sqrt(2 g h) from the speed v. Fall and slide cover v^2 / (2 mu g) + mu h along x.
         """
         low, high = self.reach_of(self.block)
         side = np.where(goal[..., 0] > (low[0] + high[0]) / 2, 1.0, -1.0)
@@ -133,7 +133,7 @@ class Throw(Task):
         return place, side * speed * self.control_period
 
     def _lane(self, goal: FloatArray) -> FloatArray:
-        """Return where P begins to run up and where it stops, (..., 2, 3) m, machine's frame."""
+        """Return start of run-up and end of braking of P, (..., 2, 3) m, machine's frame."""
         place, step = self._release(goal)
         lane = np.stack([place, place], axis=-2)
         lane[..., 0, 0] -= _RUN_UP_WAY * step
@@ -144,7 +144,7 @@ class Throw(Task):
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return minus half the distance from cup to block, for a dense reward only.
 
-        It is 0 where the block is out of reach: then it has been thrown.
+        It is 0 if the block is out of reach, because the block has then been thrown.
         """
         if self.reward == "sparse":
             return {}
@@ -153,7 +153,7 @@ class Throw(Task):
         return {"approach": 0.5 * within * dense(self.gap(self.lip(state), self.top(state)))}
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Pick up the block, carry it to the run-up, let it go at the speed it needs, and brake."""
+        """Pick up the block, carry it to the start of the run-up, throw it, and brake."""
         name, up = self.block.name, np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
         goal, step = motion.goal, float(self._release(motion.goal)[1])
         while True:

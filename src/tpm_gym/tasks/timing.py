@@ -1,8 +1,9 @@
 """Timing of a path: the shortest time in which the motors can repeat the path without overheating.
 
-A motor that repeats a motion must not exceed its continuous torque on average (RMS), since the
-winding heats up with the square of the torque. Tools for time-optimal path parameterisation bound
-the torque at every point only. So the timing is found here, as a convex problem.
+The RMS torque of a motor that repeats a motion must not exceed its continuous torque, because the
+power that heats the winding grows with the square of the torque. Tools for time-optimal path
+parameterisation limit only the torque at every point. So this module computes the timing, as a
+convex problem.
 """
 
 from __future__ import annotations
@@ -28,14 +29,16 @@ def timed(
 ) -> tuple[FloatArray, FloatArray]:
     """Compute the earliest times at which P can pass the points of a path, from rest to rest.
 
-    With the path parameter s in [0, 1] and b = (ds/dt)^2, the torque is A b'/2 + B b + g, where A,
-    B and the gravity torque g follow from the closed-form dynamics. The time and the heat of all
-    motors are convex in b, and so is their sum, which Newton's method minimises. Without g, the
-    shape of the optimal b does not depend on the factors of time and heat in the sum. So the shape
-    is found once, without g. It is then scaled in time until, with g, a motor reaches a limit.
+    With the path parameter s in [0, 1], b = (ds/dt)^2 and b' = db/ds, the torque is
+    A b'/2 + B b + g, where A, B and the gravity torque g follow from the closed-form dynamics. The
+    heat is the integral over time of the squared torques of all motors. Time and heat are convex in
+    b, and so is their sum, which Newton's method minimises. Without g, the shape of the optimal b
+    does not depend on the weights of time and heat in the sum. So the optimum is computed once,
+    without g. Its times are then multiplied by the smallest factor with which no motor exceeds a
+    limit, with g included.
 
     Args:
-        machine: Machine; its payload counts.
+        machine: Machine. The torques include its payload.
         path: (N + 1, 3) m, machine's frame, points at equal distances.
         continuous: (3,) N m, largest RMS torque of each motor over the motion.
         peak: (3,) N m, largest torque of each motor.
@@ -63,7 +66,7 @@ def timed(
 
 
 def _spans(squared: FloatArray) -> FloatArray:
-    """Return the time between points, for b (N + 1,) at them."""
+    """Return the times (N,) from point to point, for b (N + 1,) at the points."""
     speed = np.sqrt(squared)
     spans: FloatArray = 2 / (len(squared) - 1) / (speed[1:] + speed[:-1])
     return spans
@@ -75,7 +78,7 @@ def _torques(squared: FloatArray, begin: FloatArray, end: FloatArray) -> FloatAr
 
 
 def _cost(squared: FloatArray, begin: FloatArray, end: FloatArray) -> float:
-    """Return the time plus the heat, the integral of the squared torques."""
+    """Return the time plus the heat, the integral of the squared torques over time."""
     heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
     return float(_spans(squared) @ (1 + heat))
 
@@ -106,7 +109,7 @@ def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
 def _derivatives(
     squared: FloatArray, begin: FloatArray, end: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in b between the ends."""
+    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in the inner values of b."""
     count, spans, torques = len(begin), _spans(squared), _torques(squared, begin, end)
     speed = np.sqrt(squared)
     weight = 1 + (torques**2).sum(axis=1)
@@ -140,7 +143,7 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Return the factor of time at which the first motor reaches a limit (bisection)."""
+    """Return the smallest factor of all times with which no motor exceeds a limit, by bisection."""
 
     def fits(factor: float) -> bool:
         found = torques / factor**2 + rest

@@ -1,6 +1,6 @@
 """Viewer in the browser: postures, modes, singular surfaces, and episodes of any task.
 
-Needs the extra ``view``. Importing this package does not import viser.
+The viewer needs the extra ``view``. Importing this package does not import viser.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class ViewConfig:
     """Port to listen on; if it is taken, the next free one."""
 
     export: Path | None = None
-    """Folder for index.html, a page with one episode of pick-and-place that needs no server; write
-    it and exit."""
+    """Folder for index.html. The page shows one episode of pick-and-place, and needs no server. The
+    program writes the page and exits."""
 
 
 def open_viewer(

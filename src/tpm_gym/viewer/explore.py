@@ -1,4 +1,4 @@
-"""Tab "Explore": point P, motors and modes choose the posture."""
+"""Tab "Explore": the user chooses a posture by point P, motors and modes."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Explore:
         self.go_home()
 
     async def _dragged(self, event: Any) -> None:
-        # A coroutine runs in viser's event loop, in order. Its threads may run out of order.
+        # Coroutines run in viser's event loop, in order. Viser's threads may run out of order.
         position = event.target.position
         self._worker.put("drag", lambda: self.drag(position))
 
@@ -150,7 +150,7 @@ class Explore:
 
     @property
     def text(self) -> str:
-        """The message in the panel why a posture does not exist, as HTML; empty if it exists."""
+        """Message in the panel that says why a posture does not exist, as HTML; empty for none."""
         return str(self._refusal.content)
 
     def _attempt(self, solve: Callable[[], Posture]) -> None:

@@ -77,7 +77,7 @@ def _recording(running: ViserServer, kind: Kind, player: Player, seed: int) -> s
 
 
 def _page(folder: Path) -> Path:
-    """Make the folder and return the path of its page; refuse to replace what is not ours."""
+    """Make the folder, and return the path of its page; replace only pages of this package."""
     page = folder / "index.html"
     try:
         folder.mkdir(parents=True, exist_ok=True)

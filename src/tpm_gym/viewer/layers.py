@@ -50,7 +50,7 @@ class Layers:
 
     Args:
         scene: Scene of a viser server.
-        kind: Layers of the machine's class.
+        kind: Kind of the machine, which computes the layers.
     """
 
     def __init__(self, scene: SceneApi, kind: Kind) -> None:

@@ -17,14 +17,14 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import reachable
 
 _AROUND = 33  # points along the half circle of link 7
-_SLACK = 1e-9  # fraction of l4, by which a leg may fail to reach a point on its boundary
+_SLACK = 1e-9  # fraction of l4 by which a leg may miss a point at the boundary of its reach
 _SMOOTHING = 4  # rounds
 _HALVINGS = 8
 _STEPS = 200  # points along each edge of a slice
 
 
 class Mesh(NamedTuple):
-    """Vertices (v, 3) m, and triangles (f, 3): each is the indices of three vertices."""
+    """Triangle mesh: vertices (v, 3) m, and faces (f, 3), three indices of vertices each."""
 
     vertices: FloatArray
     faces: NDArray[np.int64]
@@ -61,7 +61,7 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
 def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> FloatArray:
     """Cut m flat grids of points (m, a, b, 3) at the boundary of a region.
 
-    Points next to the region move to its boundary. Points farther outside become NaN.
+    Grid points next to the region move to its boundary. Points farther outside become NaN.
     """
     there = inside(points)
     found = np.where(there[..., None], points, np.nan)
@@ -119,7 +119,7 @@ SURFACES: Final = {
     "serial": ("cos_beta", "leg1", "leg2", "leg3"),
     "constraint": ("elevation",),
 }
-"""Factors by the kind of singularity where they are zero."""
+"""Names of the factors by kind of singularity; each factor is zero on a singular surface."""
 
 
 def grid_mesh(points: FloatArray) -> Mesh:
@@ -189,7 +189,7 @@ def _compact(points: FloatArray, faces: NDArray[Any]) -> Mesh:
 
 
 def _smooth(mesh: Mesh) -> FloatArray:
-    """Move each vertex to the mean of its neighbours, repeatedly."""
+    """Move each vertex to the mean of its neighbours, a few times; return the vertices."""
     points, faces = mesh
     one = faces[:, [0, 1, 2]].ravel()
     other = faces[:, [1, 2, 0]].ravel()

@@ -17,7 +17,7 @@ from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.worker import Worker
 
 _PADDED: Any = {"min": {"pad": 0.1}, "max": {"pad": 0.1}}
-"""Range of an axis: that of the curves, and a tenth more at each end."""
+"""Range of an axis: the range of the curves, and a tenth more at each end."""
 _COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118ab2")
 _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1
@@ -37,8 +37,8 @@ class Play:
         show: Called with the player after every reset and step.
 
     Attributes:
-        player: Player of the episode. None before the first step, and again after another
-            environment, engine, policy or seed is chosen.
+        player: Player of the episode. None before the first episode, and after another machine,
+            environment, engine or policy is chosen.
     """
 
     def __init__(
@@ -87,13 +87,13 @@ class Play:
         self.discard()
 
     def play(self) -> None:
-        """Run the episode, and the episodes after it, in real time."""
+        """Run the episode, and the episodes after it, at the speed in the panel."""
         self._ready()
         self.playing = True
         self._set_speed()
 
     def pause(self) -> None:
-        """Hold the episode."""
+        """Pause the episode."""
         self._worker.stop_ticking()
         if self.playing:
             self.playing = False
@@ -112,7 +112,7 @@ class Play:
         self._begin(self._made())
 
     def discard(self) -> None:
-        """Close the environment; the next one has the options of the panel."""
+        """Close the environment; the next environment has the options of the panel."""
         self.pause()
         if self.player is not None:
             self.player.close()
@@ -196,7 +196,7 @@ class Play:
     def _draw(
         self, place: int, title: str, names: tuple[str, ...], rows: Sequence[Any], length: int
     ) -> None:
-        """Show the curves in the plot of their names, and hide the other plots.
+        """Show curves in the plot for these names and this length, and hide the other plots.
 
         The other plots are not removed, because a page may still have to process updates of them.
         """
@@ -227,7 +227,7 @@ class Play:
 
     @property
     def plots(self) -> list[GuiUplotHandle]:
-        """Plots of the reward terms and the torques that are shown."""
+        """Visible plots: of the reward terms, and of the torques."""
         return [plot for plots in self._plots for plot in plots.values() if plot.visible]
 
     @property

@@ -83,7 +83,7 @@ class Player:
 
     Attributes:
         task: The environment's task.
-        records: One for each step of the episode so far.
+        records: Records of the steps of the episode so far.
         ended: Whether the episode has ended, or none has begun.
 
     Raises:

@@ -102,7 +102,10 @@ class RobotScene:
         self._poses = poses
 
     def set_objects(self, scene: Scene, tolerance: float) -> None:
-        """Replace objects, goal markers, belt and paint by the task's."""
+        """Replace the objects, goal markers, belt and paint by those of ``scene``.
+
+        The goal markers have the radius ``tolerance``, m.
+        """
         for name in _TASK:
             self._scene.remove_by_name(name)
         patches = painted(scene)

@@ -20,7 +20,7 @@ _TAKEN = errno.EADDRINUSE, errno.EACCES
 
 
 def start(host: str, port: int) -> ViserServer:
-    """Start a server at the port, or at the next free one; at any free one if the port is 0.
+    """Start a server at the port or the next free port; for port 0, at any free port.
 
     Raises:
         ConfigurationError: If the address is not this computer's, or the port is not possible.
@@ -49,7 +49,7 @@ def _free_port(host: str, port: int) -> int:
 
 
 def _bound(host: str, port: int) -> int | None:
-    """Return the port that a server gets for ``port``; None if the port is taken."""
+    """Return ``port``, or a free one instead of 0; None if the port is taken."""
     try:
         family = socket.getaddrinfo(host, port)[0][0]
         with socket.create_server((host, port), family=family) as found:

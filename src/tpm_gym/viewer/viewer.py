@@ -1,4 +1,4 @@
-"""The viewer: a server of a page with the robot, and the panel beside it."""
+"""Viewer: server of a page that shows the robot and, beside the robot, a panel with controls."""
 
 from __future__ import annotations
 

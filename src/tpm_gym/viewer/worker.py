@@ -36,15 +36,15 @@ class Worker:
             self._change.notify_all()
 
     def ask(self, name: str, job: Job) -> None:
-        """Run a job because a user changed a control.
+        """Run a job for a control that has changed, if a user has changed it.
 
-        Do nothing if a job of this thread has changed the control.
+        If a job of this thread has changed the control, do nothing.
         """
         if threading.current_thread() is not self._thread:
             self.put(name, job)
 
     def tick(self, period: float, job: Job) -> None:
-        """Run a job every ``period`` seconds, or as often as the jobs leave time."""
+        """Run a job every ``period`` seconds, or less often if other jobs take longer."""
         with self._change:
             self._ticking, self._due = (period, job), time.monotonic()
             self._change.notify_all()

@@ -1,10 +1,10 @@
 """Links, joints and loop closures of a Delta, its inertias, and the angles of its passive joints.
 
-A rod has a universal joint at its arm, with a small cross between them, so that it cannot spin
-about its own axis. A ball joint connects it to the platform and closes a loop. The platform belongs
-to no leg (:func:`tpm_gym.mechanism.parts.free_platform`). When all joints are at zero, the frames
-of an arm, its crosses and its rods have x along the arm and y along the motor's axis. The frame of
-the platform is parallel to the base's.
+A universal joint, with a small cross, connects a rod to its arm, so that the rod cannot spin freely
+about its own axis. A ball joint connects the rod to the platform and closes a loop. The platform
+belongs to no leg (:func:`tpm_gym.mechanism.parts.free_platform`). When all joints are at zero, the
+frames of an arm, its crosses and its rods have x along the arm and y along the motor's axis. The
+frame of the platform is parallel to the base's frame.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ _MINUS_Y, _PLUS_Z, _ORIGIN = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
 class Inertia(NamedTuple):
-    """Constants of the dynamics; see :mod:`tpm_gym.mechanism.inertia`.
+    """Constants of the dynamics; see :mod:`tpm_gym.mechanism.inertia` for b, ``fixed``, ``spin``.
 
     Attributes:
-        motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
+        motors: For each leg, moment of inertia of the arm and of the rods' near ends about the
+            motor's axis, kg m^2.
         weights: For each leg, mass at B_i minus ``couples``, kg.
         couples: For each leg, sum of the constants b of its two rods B_iC_i, kg.
         platform: Mass at P, kg.
         fixed: For each leg, moment of inertia of its crosses about the axis of their swing, kg m^2.
-        spin: For each leg, moment of inertia of the rods about their own axes, over l4^2, kg.
+        spin: For each leg, moment of inertia of the rods about their own axes, divided by
+            l4^2, kg.
     """
 
     motors: Triple
@@ -52,7 +54,7 @@ class Inertia(NamedTuple):
 
 
 def build(g: DeltaGeometry, payload: float = 0.0) -> Mechanism:
-    """Build the mechanism with a payload (kg); cross-sections and materials are the TPM's."""
+    """Build the mechanism with a payload (kg); cross-sections and materials are as in the TPM."""
     links, closures = [_base(g)], []
     for number, leg in LEGS.items():
         links += _leg(number, leg, g)

@@ -51,7 +51,10 @@ from tpm_gym.mechanism.inertia import Swing, swing_force
 
 
 class _Leg(NamedTuple):
-    """Arm (l3 cos, l3 sin) and rod (m) in the frame of a leg, and its constants."""
+    """Arm and rod in the frame of a leg, and the leg's constants from :class:`.bodies.Inertia`.
+
+    ``cos`` is l3 cos(theta), ``sin`` is l3 sin(theta), and ``rod`` is B_iC_i, all in metres.
+    """
 
     cos: Numbers
     sin: Numbers
@@ -158,7 +161,10 @@ def potential(pose: Pose, gravity: Triple, m: Inertia) -> Numbers:
 
 
 def _drift(leg: _Leg, v: Triple, rate: Numbers) -> Numbers:
-    """Compute B_iC_i . a at theta_ddot = 0, from the second derivative of the closure."""
+    """Compute B_iC_i . a for the acceleration a of P at theta_ddot = 0, m^2/s^2.
+
+    It follows from the second derivative of the closure.
+    """
     x, _, z = leg.rod
     u, w = v[0] + leg.sin * rate, v[2] - leg.cos * rate
     return -(x * leg.cos + z * leg.sin) * rate * rate - (u * u + v[1] * v[1] + w * w)
@@ -167,7 +173,7 @@ def _drift(leg: _Leg, v: Triple, rate: Numbers) -> Numbers:
 def _inertial(
     at: Pair, leg: _Leg, v: Triple, a: Triple, rate: Numbers, change: Numbers, gravity: Triple
 ) -> tuple[Triple, Numbers]:
-    """Compute a leg's forces of inertia and weight: at P (base's frame, N), and on its motor.
+    """Compute the force and the torque that a leg's inertia and weight require.
 
     Args:
         at: Direction of the leg.
@@ -177,6 +183,9 @@ def _inertial(
         rate: Joint velocity, rad/s.
         change: Joint acceleration, rad/s^2.
         gravity: Gravity in the base's frame, m/s^2.
+
+    Returns:
+        The force at P in the base's frame, N, and the torque of the leg's motor, N m.
     """
     cos, sin, (x, y, z), motor, weight, couple, swing = leg
     (ax, _, az), (gx, gy, gz) = inwards(at, a), inwards(at, gravity)
@@ -201,7 +210,7 @@ def _turn(leg: _Leg, v: Triple, rate: float) -> Numbers:
 
 
 def _swinging(leg: _Leg) -> Numbers:
-    """Compute the moment of inertia of the swing, kg m^2."""
+    """Compute ``fixed + spin * out**2`` of a leg's :class:`.inertia.Swing`, kg m^2."""
     out = leg.rod[1]
     return leg.swing.fixed + leg.swing.spin * out * out
 

@@ -7,14 +7,14 @@ whose centre is the elbow B_i displaced inwards by l2.
 
 * Forward kinematics: P is one of the two points where three spheres intersect.
 * Inverse kinematics: the elbow is one of the two points where a circle and a sphere intersect.
-* Velocity v of P: B_iC_i . v = B_iC_i . dB_i/dtheta_i theta_i', in short A v = B theta'. The rods
-  are the rows of A; det A is zero at parallel singularities. B is diagonal; one of its entries is
-  zero at a serial singularity.
-* Constraint: each pair of rods keeps the platform from turning about the normal of its plane. Where
-  these three normals are coplanar, the platform can turn.
+* Velocity v of P: B_iC_i . v = B_iC_i . dB_i/dtheta_i theta_dot_i, in short A v = B theta_dot. The
+  rods are the rows of A; det A is zero at parallel singularities. B is diagonal; one of its entries
+  is zero at a serial singularity.
+* Constraint: the two rods of a leg lie in one plane, and keep the platform from turning about the
+  normal of this plane. Where the three normals are coplanar, the platform can turn.
 
-As in :mod:`tpm_gym.kinematics.equations`, the functions compute with the numbers of a namespace,
-check nothing, and return whether a solution is real.
+As in :mod:`tpm_gym.kinematics.equations`, the functions take floats, arrays or tensors, check
+nothing, and return whether a solution exists.
 """
 
 import math
@@ -44,7 +44,7 @@ class Pose(NamedTuple):
         bars: Vectors B_iC_i in the base's frame, m.
         parallel: det A, m^3.
         serial: B_iC_i . dB_i/dtheta_i, m^2/rad.
-        constraint: Determinant of the normals of the legs' planes, m^3.
+        constraint: Determinant of the three normals of the planes of the rods, m^3.
     """
 
     cos: Triple
@@ -68,12 +68,12 @@ def cross(a: Triple, b: Triple) -> Triple:
 
 
 def inwards(leg: Pair, v: Triple) -> Triple:
-    """Convert a vector from the base's frame to a leg's."""
+    """Convert a vector from the base's frame to the frame of a leg."""
     return leg[0] * v[0] + leg[1] * v[1], leg[0] * v[1] - leg[1] * v[0], v[2]
 
 
 def outwards(leg: Pair, v: Triple) -> Triple:
-    """Convert a vector from a leg's frame to the base's."""
+    """Convert a vector from the frame of a leg to the base's frame."""
     return leg[0] * v[0] - leg[1] * v[1], leg[0] * v[1] + leg[1] * v[0], v[2]
 
 
@@ -110,7 +110,7 @@ def assembly_at(
 
 
 def posture_at(point: Triple, bends: Triple, g: AnyDelta, ns: Namespace) -> tuple[Triple, Numbers]:
-    """Compute theta in (-pi, pi] for the signs of a working mode, and whether it is real."""
+    """Compute theta in (-pi, pi] for the signs of a working mode, and whether theta is real."""
     inner = g.l2 - g.l1
     (x1, y1, z), (x2, y2, _) = inwards(ONE, point), inwards(TWO, point)
     x3, y3, _ = inwards(THREE, point)
@@ -155,7 +155,7 @@ def regular(pose: Pose, g: AnyDelta) -> Numbers:
 
 
 def resolve(pose: Pose, h: Triple) -> Triple:
-    """Solve B_iC_i . v = h_i, for a velocity or an acceleration of P."""
+    """Solve B_iC_i . v = h_i for v, a velocity or an acceleration of P."""
     one, two, three = pose.bars
     a, b, c = cross(two, three), cross(three, one), cross(one, two)
     p, q, r = h[0] / pose.parallel, h[1] / pose.parallel, h[2] / pose.parallel
@@ -167,7 +167,7 @@ def resolve(pose: Pose, h: Triple) -> Triple:
 
 
 def velocity(pose: Pose) -> tuple[Triple, Triple, Triple]:
-    """Compute the rows of J (v = J theta'), m/rad; J exists at serial singularities too."""
+    """Compute the rows of J (v = J theta_dot), m/rad; J exists at serial singularities too."""
     one, two, three = pose.bars
     a, b, c = cross(two, three), cross(three, one), cross(one, two)
     p, q, r = pose.serial

@@ -10,7 +10,7 @@ from tpm_gym.kinematics.namespaces import Numbers
 
 
 class DeltaLengths(NamedTuple):
-    """Lengths l1 to l5 as any kind of numbers, such as tensors; they are not checked."""
+    """Lengths l1 to l5, m, as any kind of numbers, such as tensors, without checks."""
 
     l1: Numbers
     l2: Numbers
@@ -21,13 +21,13 @@ class DeltaLengths(NamedTuple):
 
 @dataclass(frozen=True)
 class DeltaGeometry:
-    """Lengths of a Delta, m, numbered as the same parts of the paper's mechanism.
+    """Lengths of a Delta, m. Each has the number of the matching length of the paper's mechanism.
 
     Attributes:
         l1: Radius of the base: distance from O to each actuated pivot A_i.
-        l2: Radius of the platform: distance from P to C_i. May be zero.
-        l3: Actuated arms A_iB_i.
-        l4: Rods B_iC_i.
+        l2: Radius of the platform: distance from P to C_i; may be zero.
+        l3: Length of the actuated arms A_iB_i.
+        l4: Length of the rods B_iC_i.
         l5: Half the distance between the two rods of a leg. It does not change the kinematics.
 
     Raises:
@@ -66,7 +66,8 @@ WORKING_MODES: Final[tuple[Triple, ...]] = tuple(
 """Eight working modes: for each leg, the sign of B_iC_i . dB_i/dtheta_i; 1 if the elbow is out."""
 ELBOWS_OUT: Final[Triple] = (1.0, 1.0, 1.0)
 ASSEMBLY_MODES: Final = (-1.0, 1.0)
-"""Two assembly modes: the sign of det A, which is 1 if P is below the elbows."""
+"""Two assembly modes: the sign of det A, where A has the rows B_iC_i. The sign is 1 if P is below
+the elbows."""
 
 
 def require_delta(geometry: object) -> None:
@@ -97,6 +98,7 @@ IRB_360 = DeltaGeometry(l1=0.164, l2=0.044, l3=0.524, l4=1.244, l5=0.050)
 """ABB's FlexPicker IRB 360-1/1600, with the lengths that R. L. Williams II gives in "The Delta
 Parallel Robot: Kinematics Solutions" (Ohio University, 2016). The base is a triangle with sides of
 0.567 m and the inner radius l1. The platform is a triangle with sides of 0.076 m and the outer
-radius l2. Arms have 0.524 m, and rods 1.244 m. Programs that others wrote after his paper have the
-same numbers, for example giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. l5 is ours:
-with his 65.5 mm, the ball joints of our rods would touch on the platform."""
+radius l2. Arms are 0.524 m long, and rods 1.244 m. Programs that others wrote after his paper have
+the same numbers, for example giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. We chose
+l5 ourselves: with the half distance of 65.5 mm in his paper, the ball joints of our rods would
+touch on the platform."""

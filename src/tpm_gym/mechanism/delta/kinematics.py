@@ -1,8 +1,8 @@
 """Kinematics of the Delta for arrays and tensors.
 
-Points and joint angles are arrays (..., 3), m and rad, or tensors, which can be differentiated.
+Points (m) and joint positions (rad) are arrays (..., 3), or tensors, which can be differentiated.
 Results are NaN where there is no solution. All functions raise InputError for arrays of another
-shape, or numbers that are not finite.
+shape, and for numbers that are not finite.
 """
 
 from typing import NamedTuple
@@ -43,12 +43,13 @@ from tpm_gym.mechanism.delta.geometry import (
 
 
 class Factors(NamedTuple):
-    """Factors without a unit; each is zero at the singularities of its kind.
+    """Factors without a unit; each factor is zero at the singularities of its kind.
 
     Attributes:
-        parallel: (...,) det A over l4^3; zero where the rods are parallel to one plane.
-        serial: (..., 3) B_iC_i . dB_i/dtheta_i over l3 l4; zero where a leg is stretched or folded.
-        constraint: (...,) volume that the normals of the parallelograms span, over l4^3; zero
+        parallel: (...,) det A divided by l4^3; zero where the rods are parallel to one plane.
+        serial: (..., 3) B_iC_i . dB_i/dtheta_i divided by l3 l4; zero where a leg is stretched or
+            folded.
+        constraint: (...,) volume that the normals of the parallelograms span, divided by l4^3; zero
             where the normals are parallel to one plane.
     """
 
@@ -81,7 +82,7 @@ def inverse_all(position: ArrayLike, geometry: AnyDelta = IRB_360) -> FloatArray
 
 
 def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> FloatArray:
-    """Compute J (..., 3, 3) m/rad, v = J theta', in the assembly mode of this sign of det A."""
+    """Compute J (v = J theta_dot), (..., 3, 3) m/rad, in the assembly mode ``side``."""
     require_delta(geometry)
     require_side(side)
 
@@ -94,7 +95,7 @@ def jacobian(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) 
 
 
 def factors(theta: ArrayLike, side: float = 1.0, geometry: AnyDelta = IRB_360) -> Factors:
-    """Compute the factors that are zero at singularities, without a unit."""
+    """Compute the factors that are zero at singularities; the factors have no unit."""
     require_delta(geometry)
     require_side(side)
 
@@ -154,7 +155,7 @@ def reachable(
 
 
 def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
-    """Explain which leg does not reach a point (3) m, and by how much."""
+    """Explain which leg does not reach a point (3,) m, and by how much."""
     legs, inner = [inwards(leg, point) for leg in (ONE, TWO, THREE)], geometry.l2 - geometry.l1
     margins = [leg_margin(level + inner, up, out, geometry) for level, out, up in legs]
     worst = margins.index(min(margins))
@@ -165,7 +166,10 @@ def no_posture(point: Vector, geometry: DeltaGeometry) -> UnreachableError:
 def no_assembly(
     theta: Vector, side: float, geometry: DeltaGeometry
 ) -> UnreachableError | SingularityError:
-    """Explain why the Delta cannot be assembled at theta (3) rad, or has no velocity."""
+    """Explain why the Delta has no solution at theta (3,) rad.
+
+    Either there is no assembly, or J does not exist, or the working mode is not the machine's.
+    """
     with np.errstate(all="ignore"):
         cos, sin = arms_at(tuple(map(np.float64, theta)), geometry, NUMPY)
         position, real, height2 = assembly_at(cos, sin, side, geometry, NUMPY)

@@ -36,7 +36,7 @@ class Delta(CompiledMachine):
     Attributes:
         geometry: Lengths.
         working_mode: For each leg, 1 if the elbow is out, and -1 if it is in.
-        assembly_mode: 1 if P is below the elbows, and -1 if it is above.
+        assembly_mode: 1 if P is below the elbows, and -1 if P is above the elbows.
     """
 
     geometry: DeltaGeometry
@@ -114,11 +114,12 @@ DELTA = Delta(
     geometry=IRB_360,
     mount=Mount(height=1.23),
     # As large as the region of WIDE_TPM, in the middle of a workspace that is 1.6 m wide: with the
-    # step limit, an expert crosses it twice in an episode. The conditioning is 0.36 and more.
+    # step limit, an expert crosses the region twice in an episode. The conditioning is at least
+    # 0.36.
     region=Region(low=(-0.20, -0.20, 0.86), high=(0.20, 0.20, 1.163)),
     goal_region=Region(low=(-0.17, -0.17, 0.90), high=(0.17, 0.17, 1.16)),
     home=(0.0, 0.0, 1.03),
 )
-"""Machine with the lengths of ABB's IRB 360, upside down over a table as the TPM."""
+"""Machine with the lengths of ABB's IRB 360. Like the TPM, it hangs upside down over a table."""
 
 register_machine("delta", DELTA)

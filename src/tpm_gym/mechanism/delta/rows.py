@@ -1,4 +1,4 @@
-"""Compiled loops of the Delta (:mod:`tpm_gym.mechanism.loops`).
+"""Compiled loops over many Deltas (:mod:`tpm_gym.mechanism.loops`).
 
 A row of ``built`` (b, 21) holds l1 to l5 (m) and the constants of the dynamics. ``machine`` (7,)
 holds the sign of the assembly mode, the signs of the working mode (3), and gravity.

@@ -1,7 +1,7 @@
 """The mechanism from a Geometry: links, joints, inertias and loop closures.
 
-Some physics engines need a tree of links, so the loops are cut. This is the spanning tree, with
-the paper's numbers of links (Fig. 1):
+Some physics engines need a tree of links, so the loops are cut. The spanning tree, with the links
+numbered as in the paper (Fig. 1), is:
 
     base 0 - arm 2  - two rods 4                                        (branch I, the 4S rods)
     base 0 - arm 5  - rod 6 - link 3' - link 7 - platform 1 - end link 10   (branch II, platform)
@@ -11,9 +11,9 @@ Four ball joints close the loops. They connect the far ends of rods 4 to link 3'
 of rods 11 to end link 10. A rod with a ball joint at both ends could spin about its own axis. So
 rods 4 have a universal joint at the arm instead. Rods 11 turn on the paper's revolutes R_e and R_f.
 R_g and R_h are ball joints here, since revolutes would add redundant constraints. So end link 10, a
-straight bar through both of them, can roll about its own axis.
+straight bar through these two ball joints, can roll about its own axis.
 
-All frames are parallel to the paper frame when all joints are at zero: arms and rods then point
+When all joints are at zero, all frames are parallel to the paper frame, and arms and rods point
 along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 """
 
@@ -173,7 +173,7 @@ def joint_angles(
 
     Raises:
         InputError: If theta (3,) rad has the wrong shape or is not finite.
-        UnreachableError: If the branch does not exist at theta.
+        UnreachableError: If the assembly mode ``branch`` does not exist at theta.
     """
     angles = joint_arrays(vector("theta", theta), branch, geometry)
     return {name: float(angle) for name, angle in angles.items()}
@@ -197,11 +197,11 @@ def joint_arrays(
 def rotated_joint_angles(
     theta: ArrayLike, branch: RotatedMode, geometry: Geometry = PAPER
 ) -> dict[str, float]:
-    """Compute the angles of all joints, rad, on a branch of the rotated operation mode.
+    """Compute the angles of all joints, rad, in an assembly mode of the rotated operation mode.
 
     Raises:
-        InputError: If theta has the wrong shape or is not finite, or if the branch does not exist
-            at theta.
+        InputError: If theta has the wrong shape or is not finite, or if the assembly mode
+            ``branch`` does not exist at theta.
     """
     angles = vector("theta", theta)
     found, slot = forward_rotated(angles, geometry), branch.index
@@ -226,11 +226,18 @@ def _by_joint(
     g: Geometry,
     turn: FloatArray | float = 0.0,
 ) -> dict[str, FloatArray]:
-    """Compute joint angles from the rods 4a, 4b, 6 and 11 (x, y, z) m, and link 7's beta, rad.
+    """Compute the angles of all joints, rad, from the vectors along the rods.
 
     A swing is the angle of a rod in the plane of its arm, and a tilt is the rod's elevation out of
-    this plane. A joint angle is a link's angle minus its parent's. ``turn`` (rad) is the rotation
-    of link 3' and the platform about y; joint angles are rotations about -y.
+    this plane. A joint angle is a link's angle minus its parent's.
+
+    Args:
+        theta: Angles of the motors, rad.
+        rods: Vectors (x, y, z) along rods 4a, 4b, 6 and 11, m.
+        beta: Angle of link 7 about z, rad.
+        g: Link lengths.
+        turn: Rotation of link 3' and the platform about y, rad. Joints R23 and R33 turn about
+            -y.
     """
     theta_1, theta_2, theta_3 = theta
     (x_4a, y_4a, z_4a), (x_4b, y_4b, z_4b), (x_6, _, z_6), (x_11, y_11, z_11) = rods

@@ -1,8 +1,8 @@
 """TPM that works on both sides of y = 0.
 
-Inverse kinematics and dynamics are even functions of y. So a posture and its mirror image in the
-plane y = 0, a parallel singularity, have equal joint positions, inertia and torques. They differ in
-the assembly mode, and so in the sign of y in the forward kinematics.
+The plane y = 0 is a parallel singularity. Inverse kinematics and dynamics are even functions of y.
+So a posture and its mirror image in this plane have equal joint positions, inertia and torques. The
+two postures differ in the assembly mode, and so in the sign of y in the forward kinematics.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tpm_gym.mechanism.tpm.machine import TPM
 _AT_PLANE: Final = 0.05
 """Distance from the plane, as a share of l7, below which the assembly mode is not checked.
 
-Joint positions that are wrong by 1e-4 rad may have no assembly there.
+Closer to the plane, joint positions with an error of 1e-4 rad may have no assembly.
 """
 
 
@@ -30,7 +30,7 @@ Joint positions that are wrong by 1e-4 rad may have no assembly there.
 class BothSides(TPM):
     """TPM that may change to the mirror image of its assembly mode.
 
-    Its region is symmetric about y = 0. Forward kinematics, Jacobian and ``home`` belong to its
+    The region is symmetric about y = 0. Forward kinematics, Jacobian and ``home`` belong to
     ``assembly_mode``. Functions of a position use the assembly mode of the side of y = 0 on which
     the position lies.
     """
@@ -73,10 +73,11 @@ class BothSides(TPM):
 def both_sides(machine: Machine) -> BothSides:
     """Return a TPM that works on both sides of y = 0.
 
-    Its region is the smallest box around the region of ``machine`` and the region's mirror image.
+    The new region is the smallest box around the region of ``machine`` and its mirror image.
 
     Raises:
-        ConfigurationError: If the machine is no TPM, or not in its modes in the whole region.
+        ConfigurationError: If the machine is no TPM, or if it is not in its modes at a corner of
+            the region or at a point next to y = 0.
         UnreachableError: If a corner of the region, or a point next to y = 0, cannot be reached.
     """
     if not isinstance(machine, TPM):

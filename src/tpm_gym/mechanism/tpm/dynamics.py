@@ -11,15 +11,15 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
 
 * the arms turn about the motors' axes;
 * a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points. Rods 4 and 11
-  also turn about their own axes as they swing. The inertia of the swing contains this turning, the
-  crosses of rods 4, and end link 9;
+  also turn about their own axes as they swing. The inertia of the swing contains the inertia of
+  this turning, of the crosses of rods 4, and of end link 9;
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z. It is a bar between C1 and P, except for constant offsets;
 * platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
   roll about its own axis, which does not change the motors' torques and is left out.
 
 Units are SI. In the paper frame, gravity points along +z, as the base hangs upside down. Functions
-with a Pose take the numbers of :mod:`tpm_gym.kinematics.equations`.
+with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def pose_at(
     """Assemble the mechanism at joint angles, for the signs of an assembly mode.
 
     Returns:
-        The configuration, and whether it is real.
+        The configuration, and whether it exists.
     """
     cos, sin = equations.arms(theta, g, ns)
     found, real, _ = equations.assembly_at(cos, sin, signs[0], signs[1], g, ns)
@@ -171,9 +171,9 @@ def potential(pose: Pose, gravity: Triple, m: Inertia) -> Numbers:
 
 
 def velocities(pose: Pose, rates: Triple) -> tuple[Numbers, tuple[Triple, Triple, Triple]]:
-    """Compute l7 times the rate of beta, and the changes of B_iC_i, m/s.
+    """Compute l7 times the rate of beta, and the rates of the vectors B_iC_i, m/s.
 
-    They follow from the first derivatives of the closures.
+    All of them follow from the first derivatives of the closures.
     """
     (c1, c2, c3), (s1, s2, s3), (u1, u2, u3), f = pose.cos, pose.sin, rates, pose.factors
     x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
@@ -192,7 +192,8 @@ def accelerations(
     """Compute accelerations, m/s^2, from the second derivatives of the closures.
 
     Returns:
-        B1 along y and z, B2 and B3 along x and z; C1 along x and z; P.
+        Accelerations of B1 along y and z, of B2 and B3 along x and z, of C1 along x and z, and of
+        P.
     """
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (_, r1y, r1z), (r2x, _, r2z), (r3x, r3y, r3z) = pose.rods
@@ -216,11 +217,12 @@ def accelerations(
 def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
     """Solve B_iC_i . a_i = h_i for the motion of C1 and the turn of link 7.
 
-    Here a_i is the velocity of C_i, or its acceleration (of C_3 without the centripetal part).
+    Here a_i is the velocity or the acceleration of C_i; the acceleration of C_3 is taken without
+    its centripetal part.
 
     Returns:
-        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z, and l7 times the rate of
-        beta or the change of this rate.
+        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z, and l7 beta' (m/s) or
+        l7 beta'' (m/s^2).
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     x, z = (r2z * h1 - r1z * h2) * pose.per_planar, (r1x * h2 - r2x * h1) * pose.per_planar

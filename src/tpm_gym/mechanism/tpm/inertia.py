@@ -16,11 +16,12 @@ class Inertia(NamedTuple):
     """Constants of the dynamics; :mod:`tpm_gym.mechanism.inertia` defines b and :class:`Swing`.
 
     Attributes:
-        motors: For each leg, inertia of arm and near ends of rods about the motor, kg m^2.
+        motors: For each leg, moment of inertia of the arm and of the rods' near ends about the
+            motor's axis, kg m^2.
         weights: For each leg, mass at B_i minus ``couples``, kg.
         couples: For each leg, sum of the constants b of its rods B_iC_i, kg.
         link3: Mass at C1, kg.
-        link7: b of link 7, kg.
+        link7: Constant b of link 7, kg.
         platform: Mass at P, kg.
         swing1: Inertia of the swing of leg 1, about x.
         swing3: Inertia of the swing of leg 3, about y.

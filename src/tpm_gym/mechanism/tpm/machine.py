@@ -30,8 +30,8 @@ from tpm_gym.mechanism.tpm.inertia import inertia_of
 class TPM(CompiledMachine):
     """Mechanism of the paper, with any lengths.
 
-    For other lengths, use ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)``. If they
-    differ much, change ``mount``, ``region``, ``goal_region``, ``home``, ``step_limit`` and
+    For other lengths, use ``dataclasses.replace(PAPER_TPM, name=..., geometry=...)``. If the
+    lengths differ much, change ``mount``, ``region``, ``goal_region``, ``home``, ``step_limit`` and
     ``table`` too.
 
     Attributes:
@@ -124,7 +124,8 @@ PAPER_TPM = TPM(
     step_limit=(0.030, 0.005, 0.030),
     joint_limit=0.08,
     # At 0.08, a joint error of 1 mrad moves the platform by 3 mm at most. Towards y = 0, that
-    # motion grows without bound and the conditioning falls with y. A sixth of the region is below.
+    # motion grows without bound and the conditioning falls with y. In a sixth of the region, the
+    # conditioning is below 0.08.
     safe_conditioning=0.08,
 )
 """Machine with the lengths of the paper's case study, upside down over a table."""
@@ -133,8 +134,8 @@ WIDE_TPM = TPM(
     name="wide",
     geometry=WIDE,
     mount=Mount(height=0.95),
-    # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin,
-    # and extended towards y = 0, where the penalty begins.
+    # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin.
+    # It is extended towards y = 0, to points whose conditioning is so low that the penalty acts.
     region=Region(low=(0.12, 0.10, 0.58), high=(0.48, 0.50, 0.883)),
     goal_region=Region(low=(0.14, 0.12, 0.62), high=(0.46, 0.48, 0.88)),
     home=(0.30, 0.36, 0.75),

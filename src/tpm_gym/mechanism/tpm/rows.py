@@ -1,4 +1,4 @@
-"""Compiled loops of the TPM (:mod:`tpm_gym.mechanism.loops`).
+"""Compiled loops over many TPMs (:mod:`tpm_gym.mechanism.loops`).
 
 A row of ``built`` (b, 23) holds l1 to l7 (m) and the constants of the dynamics. ``machine`` (9,)
 holds the signs of the assembly mode (2) and of the working mode (4), and gravity.

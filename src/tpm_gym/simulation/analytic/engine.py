@@ -39,11 +39,12 @@ from tpm_gym.simulation.state import Scene
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _NEAR_PLANE = 1.2
-"""Distance from the plane of ``mirror_axis``, divided by the machine's step limit.
+"""Distance of P from the plane of symmetry normal to ``mirror_axis``, divided by the machine's
+``step_limit`` (m) along this axis.
 
 Beyond this distance, torques are computed from differences of joint positions. At this distance
-and at full speed, these differences have an error of 0.2 m/s^2 in P's acceleration normal to the
-plane.
+and at full speed, P's acceleration normal to the plane, if computed from these differences, has an
+error of 0.2 m/s^2.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -62,8 +63,8 @@ class AnalyticEngine:
         drive: Servo drives of the motors; None for ideal drives.
 
     Attributes:
-        least_steps: Smallest number of time steps in a control period. Accelerations are found from
-            the last three points of a path.
+        least_steps: Smallest number of time steps in a control period, because accelerations are
+            computed from the last three points of a path.
         torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
             ``physics.torques`` is ``"every"``.
 
@@ -195,10 +196,11 @@ class AnalyticEngine:
             self._repeat(rows, start, path, vacuum)
 
     def _near_plane(self, axis: int, path: Path) -> BoolArray:
-        """Return whether P or its path is near the plane of ``mirror_axis`` or crosses it, (n,).
+        """Return whether P or its path is near the plane of symmetry, or the path crosses it, (n,).
 
-        Near the plane, differences of the joint positions do not give the torques. The result is
-        True for all robots if any robot has had encoder bias or length errors.
+        The plane is normal to ``mirror_axis``. Near the plane, torques cannot be computed from
+        differences of the joint positions. The result is True for all robots if any robot has had
+        encoder bias or length errors.
         """
         if not self._exact:
             return np.ones(self._count, dtype=np.bool_)

@@ -92,8 +92,9 @@ class ServoSteps:
 
 
 Touch = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Function of P, (r, 3) m each: one time step earlier, at the beginning, and at the end of a time
-step. It returns the force (r, 3) N of objects on P and the mass (r,) kg of the held objects."""
+"""Function of three positions of P, each (r, 3) m: one time step before the beginning, at the
+beginning, and at the end of a time step. The function returns the force (r, 3) N of objects on P
+and the mass (r,) kg of the held objects."""
 
 
 def march(

@@ -2,9 +2,10 @@
 
 In the plane of the singularity, the inertia M at the motors' axes is infinite. The inertia of P is
 finite: it is K^T M K, where K is the inverse Jacobian, theta_dot = K v, and v is the velocity of P.
-It changes smoothly with the distance from the plane, and is equal on both sides. So this module
-integrates v, not the joint velocities. In the plane, the column of K for the direction normal to
-the plane is zero. There, the motors cannot accelerate P in this direction, and P keeps its speed.
+The inertia of P changes smoothly with the distance from the plane, and is equal on both sides. So
+this module integrates v, not the joint velocities. In the plane, the column of K for the direction
+normal to the plane is zero. There, the motors cannot accelerate P in this direction, and P keeps
+its speed.
 """
 
 from __future__ import annotations
@@ -21,11 +22,12 @@ from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, Tou
 _LIFT: Final = 5e-5
 """Smallest distance from the plane, m, at which inertia and forces are computed.
 
-Closer to the plane, the values at this distance are used. They change with the square of the
-distance, so the error is smaller than the rounding errors at the true distance.
+Closer to the plane, the values at this distance are used. The values change with the square of the
+distance. So the error of this replacement is smaller than the rounding errors of values computed at
+the true distance.
 """
 _BESIDE: Final = 1e-4
-"""Distance, m, from P to two points before and behind it on the line of its velocity.
+"""Distance, m, from P to a point ahead of it and to a point behind it, on the line of its velocity.
 
 The joint positions at the three points give the second derivative of the joint positions at P.
 """
@@ -55,7 +57,8 @@ class _Lifted(NamedTuple):
 
     Attributes:
         points: Points mirrored to this side, at least _LIFT away from the plane, (r, 3) m.
-        side: 1, or -1 for the mirrored component, (r, 3).
+        side: Factors (r, 3): -1 for the component normal to the plane if the point was mirrored,
+            else 1.
         theta: Joint positions at ``points``, (r, 3) rad.
         own_rate: Inverse Jacobian K at ``points``, (r, 3, 3) rad/m, with theta_dot = K v.
         rate: K at the original points, (r, 3, 3) rad/m. Its column for the direction normal to the

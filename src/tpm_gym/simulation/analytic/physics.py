@@ -19,10 +19,10 @@ class Physics(Numerics):
             more.
         torques: Time steps in which the torques of ideal motors are computed and compared with
             their largest torques. ``"none"``: torques are not limited, and are NaN in the State.
-            ``"last"``: the last time step of a control period; if its torque is above half of a
-            motor's largest torque, all time steps. ``"every"``: all time steps. Torques are always
-            computed and limited in all time steps for servo drives, and for robots that need
-            forward dynamics.
+            ``"last"``: the last time step of a control period; but all its time steps if, in the
+            last one, a motor's torque is above half of the motor's largest torque. ``"every"``: all
+            time steps. For servo drives, and for robots that need forward dynamics, torques are
+            always computed and limited in all time steps.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -99,8 +99,10 @@ def ideal_push(
 
     Args:
         theta: (r, 3) rad, joint positions at the beginning of the time step.
-        rates: (r, 3) rad/s, joint velocities at the end of the time step without torques.
-        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes plus their compliance.
+        rates: (r, 3) rad/s, joint velocities that the time step would end with if the torques were
+            zero.
+        inverse: (r, 3, 3) 1/(kg m^2), inverse inertia at the motors' axes, plus the compliance of
+            the motors.
         torque: (r, 3) N m, output.
     """
     for row in range(len(effort)):
@@ -235,8 +237,9 @@ def modes_left(
 def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
     """Compute the joint velocities u after an impulse, with Coulomb friction.
 
-    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, its
-    size is at most limit. So u minimises u @ mass @ u / 2 - impulse @ u + limit @ |u|.
+    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, the
+    size of the resistance is at most limit. So u minimises
+    u @ mass @ u / 2 - impulse @ u + limit @ |u|.
 
     Args:
         mass: Inertia, kg m^2.

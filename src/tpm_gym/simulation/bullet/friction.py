@@ -1,24 +1,26 @@
 """Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
-**Level faces.** The solver limits the friction force of a contact to mu N along each of two
-directions. At 45 degrees to these directions, friction is sqrt(2) times too strong, and it does not
-oppose the slip. On a level face the directions are the world's x and y, and Bullet can scale both
-limits for each body. For a slipping contact, this module scales them so that a corner of the box
-lies on the cone, opposite to the slip. For a sticking contact, the limit along x follows from the
-cone and the last force along y, and vice versa. Without a last force, the box lies inside the cone.
+**Level faces.** The solver limits the friction force of a contact to mu N (coefficient times normal
+force) along each of two directions. At 45 degrees to these directions, friction is sqrt(2) times
+too strong, and it does not oppose the slip. On a level face the directions are the world's x and
+y, and Bullet can scale both limits for each body. For a slipping contact, this module scales both
+limits so that a corner of the box lies on the cone, opposite to the slip. For a sticking contact,
+the limit along x follows from the cone and the last force along y, and vice versa. Without a last
+force, the box lies inside the cone.
 
-**Slides.** All points of a contact share these scales, and contacts between objects have none. So
-this module adds the friction that was missing in the last time step, as a force and a torque. This
-is mu N against the slip of each point, minus the solver's friction.
+**Slides.** All points of a contact share these scales, and contacts between objects have no scales.
+So this module adds the friction that was missing in the last time step, as a force and a torque.
+The missing friction is mu N against the slip of each point, minus the solver's friction.
 
 **Upright faces.** The solver takes N from a solution without friction. But a block that the lip
 pushes leans on the lip only because the table brakes it. In a solution without friction N is 0, so
 the solver allows no friction at the lip. So this module computes the missing friction from the last
 N, and adds it as a force.
 
-Remaining errors, measured in ``tests/simulation/test_friction.py``: direction and added forces lag
-by one time step. The smaller scale never falls below :data:`_LEAST`. A level contact between two
-objects has the friction box while it sticks, and in the first time step of a slide.
+Some errors remain (measured in ``tests/simulation/test_friction.py``). The scales and the added
+forces lag by one time step, since they are computed from the last one. The smaller scale never
+falls below :data:`_LEAST`. A level contact between two objects has the friction box while it
+sticks, and in the first time step of a slide.
 """
 
 from __future__ import annotations
@@ -48,10 +50,10 @@ _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction o
 _BOX = (1.0, 1.0)  # Bullet's default scales
 _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
-"""Friction that was added to a contact in a time step, N.
+"""Record of the friction force that was added to a contact in a time step: two entries, N.
 
-It is given as the second part of the force (see ``compiled.friction_force``), and the largest force
-that could be added.
+The added force has two parts (see ``compiled.friction_force``). The first entry is the second part.
+The second entry is the largest size of the added force that the contact forces allow.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
@@ -60,13 +62,13 @@ _Slip = tuple[float, float, float, float]
 _Wrench = tuple[float, float, float, float, float, float]
 """Force (x, y, z) N, and torque (x, y, z) N m about an object's centre."""
 _Lacks = dict[tuple[int, int], _Wrench]
-"""Friction that the solver left out in a time step, of pairs of bodies that slide on each other."""
+"""For each pair of sliding bodies, the friction that the solver left out in a time step."""
 
 
 class _Face:
     """Level face on which objects slide, and the scales of its friction along x and y.
 
-    Its surface moves along x at ``speed``, m/s.
+    The face moves along x at ``speed``, m/s.
     """
 
     def __init__(self, body: int, link: int) -> None:
@@ -160,7 +162,8 @@ class Friction:
 
         Args:
             near: Indices of the objects that the cup can touch in the control period.
-            first: First time step in which the cup can touch an object; returned if none moves.
+            first: First time step in which the cup can touch an object. This is the result if no
+                object moves and the belt, if there is one, is at rest.
         """
         if self._belts and self._belts[0].speed:  # an object at rest on the belt slips
             self._active, self._resting = list(range(len(self._bodies))), set()
@@ -244,7 +247,7 @@ class Friction:
 
         Args:
             motion: Motion of the object.
-            other: Motion of what it touches.
+            other: Motion of the body that the object touches.
             points: PyBullet's contact points.
             coefficient: Coulomb's coefficient.
             face: Face of the other body; None for an object.
@@ -399,7 +402,7 @@ def _smaller(one: float, other: float) -> float:
 def _scales(
     slips: Sequence[_Slip], points: Sequence[Any], coefficient: float
 ) -> tuple[float, float]:
-    """Return the friction limits along x and y (world) in units of mu N.
+    """Return the friction limits along x and y (world), divided by mu times the normal force.
 
     Points of a spinning object slip in different directions, but share the scales.
 
@@ -432,7 +435,7 @@ def _along(x: float, y: float) -> tuple[float, float]:
 
 
 def _used(points: Sequence[Any], coefficient: float) -> tuple[float, float]:
-    """Return the sum of friction forces along the world's x and y, in units of mu N."""
+    """Return the total friction along x and y (world), divided by mu times the normal force."""
     along_x, along_y, _ = map(sum, zip(*map(_solved, points), strict=True))
     most = coefficient * sum(point[9] for point in points)
     return (along_x / most, along_y / most) if most > 0 else (0.0, 0.0)

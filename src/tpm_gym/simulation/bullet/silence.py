@@ -1,4 +1,4 @@
-"""Output of PyBullet's C code, which is discarded."""
+"""Context manager that discards the output of PyBullet's C code."""
 
 import ctypes
 import os

@@ -31,8 +31,9 @@ _OFF = (
 class Window:
     """Window with bodies that are placed, but not simulated.
 
-    In PyBullet, each call to a client with a window may wait for a frame. A control step has some
-    hundred calls. So another client simulates, and a few calls copy each control step.
+    In PyBullet, each call to a client with a window may wait for a frame. The simulation of a
+    control step makes about 100 calls. So another client simulates, and a few calls in each control
+    step copy all poses to the window.
 
     Raises:
         ConfigurationError: If no window can open.

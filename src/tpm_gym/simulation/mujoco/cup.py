@@ -63,7 +63,7 @@ class Cup:
         self.grip = Grip()
 
     def load(self) -> Load:
-        """Return the load of the seal; call after the second half of a time step."""
+        """Return the load of the seal; call after ``mj_step2``, the second half of a time step."""
         if self.grip.hold.which < 0:
             return Load()
         row = self._row
@@ -87,7 +87,7 @@ class Cup:
         return True
 
     def set(self, grip: Grip) -> None:
-        """Weld the object of ``grip`` to the cup, if it has one, and release all others."""
+        """Weld the held object of ``grip`` (if any) to the cup, and release all other objects."""
         model, active = self._model, self._data.eq_active
         active[self._welds] = 0
         model.pair_solref[:, 0] = self._stiffness

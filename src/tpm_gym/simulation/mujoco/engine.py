@@ -46,12 +46,12 @@ class MujocoEngine:
     """Engine that simulates one robot with MuJoCo.
 
     Each call ends with the first half of the next time step (positions, contacts, constraints), so
-    that all values that can be read belong to one time.
+    that all values that can be read belong to the same instant.
 
     Args:
         gui: Whether to open MuJoCo's viewer.
-        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the value of the environment
-            variable ``MUJOCO_GL``, or else the first renderer that works.
+        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the one that the environment
+            variable ``MUJOCO_GL`` names. If it names none, the first one that works is used.
         physics: A :class:`Physics` or a mapping of its attributes.
         drive: Servo drives of the motors; None for ideal drives.
 

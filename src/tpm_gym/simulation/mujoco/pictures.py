@@ -19,7 +19,7 @@ from tpm_gym.simulation.imaging import BACKGROUND, Camera, Picture, View, metres
 RENDERERS = ("egl", "osmesa", "glfw")
 """OpenGL backends in the order in which they are tried.
 
-They draw on the GPU, on the CPU, and on a display.
+EGL draws on the GPU, or on the CPU with Mesa. OSMesa draws on the CPU. GLFW needs a display.
 """
 
 _SMALL = 128 * 128  # pixels
@@ -31,8 +31,8 @@ class Pictures:
     """Renderer of the scene. It opens an OpenGL context for the first picture of each size.
 
     Args:
-        renderer: One of :data:`RENDERERS`; None for the value of the environment variable
-            ``MUJOCO_GL``, or else the first renderer that works.
+        renderer: One of :data:`RENDERERS`; None for the one that the environment variable
+            ``MUJOCO_GL`` names. If it names none, the first one that works is used.
 
     Raises:
         ConfigurationError: If ``renderer`` is another name.
@@ -74,7 +74,7 @@ class Pictures:
             drawn = [geom for geom in scene.geoms[: scene.ngeom] if geom.segid >= 0]
             table = np.full(scene.ngeom + 1, BACKGROUND, dtype=np.int32)
             table[[geom.segid + 1 for geom in drawn]] = ids[[geom.objid for geom in drawn]]
-            # Edges of this depth are those of the ids; in smooth pictures they are not.
+            # The edges of this depth are at the edges of the ids. Smoothed edges would not be.
             shown, share = _draw(scene, context, view)
             segmentation = table[shown @ (1, 1 << 8, 1 << 16)]
         return Picture(colour, metres(share), segmentation)
@@ -123,13 +123,17 @@ def _close_all() -> None:
 
 
 def aim(own: mujoco.MjvCamera, camera: Camera) -> None:
-    """Set a camera of MuJoCo; the field of view is an attribute of the model."""
+    """Set the pose of a MuJoCo camera, not its field of view, which is stored in the model."""
     own.lookat[:], own.distance = camera.target, camera.distance
     own.azimuth, own.elevation = camera.yaw + 90.0, camera.pitch  # azimuth 0 is along +x
 
 
 def _opengl(renderer: str | None, width: int, height: int) -> Any:
-    """Open an OpenGL context with ``renderer``, or else with the first backend that works."""
+    """Open an OpenGL context for pictures of this size.
+
+    If ``renderer`` is None, the environment variable ``MUJOCO_GL`` names the backend. If it names
+    none of :data:`RENDERERS`, the first backend that works is used.
+    """
     asked = renderer or os.environ.get("MUJOCO_GL", "").lower()
     names = [asked] if asked in RENDERERS else RENDERERS
     found = (_context(name, width, height) for name in names)

@@ -3,8 +3,9 @@
 Ideal motors reach their references exactly, as far as their largest torque allows. So an ideal
 motor is a constraint on the velocity at the end of the time step, with a limited force. Dry
 friction in MuJoCo is such a constraint, with velocity zero. The first half of a time step
-(``mj_step1``) creates the rows of the friction constraints, and the second half (``mj_step2``)
-solves them. Between both, this module sets the velocity of these rows.
+(``mj_step1``) creates a row of the solver for each friction constraint, and the second half
+(``mj_step2``) computes the forces. Between the two halves, this module sets the target velocities
+of the rows.
 """
 
 from __future__ import annotations
@@ -110,7 +111,12 @@ class Robot:
         self._set_targets((0.0,))
 
     def _set_targets(self, targets: Sequence[float]) -> None:
-        """Set the targets of the ideal motors (rad), if any; the last is the cup's slide's (m)."""
+        """Set the joint positions that the constraints shall reach.
+
+        Args:
+            targets: First the joint positions of the ideal motors (rad), if the motors are ideal;
+                then the position of the cup's slide (m).
+        """
         data, rate, position, speed = self._data, self._rate, self._position, self._speed
         wanted, first = data.efc_aref, data.ne
         for (row, at, dof, gain), target in zip(self._rows, targets, strict=True):

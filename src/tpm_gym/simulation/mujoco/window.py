@@ -18,7 +18,7 @@ from tpm_gym.simulation.stage import MARKER_COLOUR
 class Window:
     """Viewer that opens at the first call of :meth:`show`, and for each new model.
 
-    After the user has closed it, it stays closed.
+    If the user closes the window, it does not open again, not even for a new model.
 
     Raises:
         ConfigurationError: If no window can open.

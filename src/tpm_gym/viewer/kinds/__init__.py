@@ -1,4 +1,4 @@
-"""Kinds of machines: what differs between mechanisms in the viewer, a file for each."""
+"""Kinds of machines: modes, postures and layers in the viewer, in one file for each mechanism."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KINDS: Final[dict[Any, type[Kind]]] = {Machine: Kind, TPM: TPMKind, Delta: Delta
 
 
 def find_kind(machine: Any) -> Kind:
-    """Return a machine, given by itself or by its name, with its modes and layers.
+    """Return the kind (modes, postures and layers) of a machine, given as an object or by name.
 
     Raises:
         ConfigurationError: If no machine has this name, or the value is no machine.

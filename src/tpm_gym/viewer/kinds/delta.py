@@ -22,7 +22,7 @@ _SHAPE: Final = (96, 96, 96)
 
 
 class DeltaKind(Kind):
-    """A Delta.
+    """Kind of a Delta.
 
     Working modes are tuples of signs. Assembly modes are 1 (P below the elbows) and -1.
     """

@@ -27,7 +27,7 @@ class Margin:
     Attributes:
         distance: Distance from P, m.
         point: The singular position (3,) m, machine's frame.
-        factor: Name of the factor that is zero there.
+        factor: Name of the factor that is zero at this position.
     """
 
     distance: float
@@ -37,7 +37,7 @@ class Margin:
 
 @dataclass(frozen=True)
 class Posture:
-    """The mechanism with closed loops; machine's frame.
+    """Configuration of a machine in which the loops are closed; machine's frame.
 
     The modes are those of a :class:`Kind`.
 
@@ -89,7 +89,7 @@ class Posture:
 class Kind:
     """Machine with its modes, postures and layers; this class shows any machine in its own modes.
 
-    A mechanism with more modes, or with layers, derives a class of its own.
+    A mechanism with more modes, or with layers, has a derived class.
 
     Attributes:
         machine: The machine.
@@ -108,7 +108,7 @@ class Kind:
     lows: Sequence[float] = (-180.0, -180.0, -180.0)
 
     def __init__(self, machine: Any) -> None:
-        """Show a machine."""
+        """Store the machine."""
         self.machine = machine
 
     def at_point(

@@ -34,7 +34,7 @@ def _label(mode: kinematics.AssemblyMode | kinematics.RotatedMode) -> str:
 
 
 class TPMKind(Kind):
-    """A TPM; working modes are WorkingModes, assembly modes AssemblyModes or RotatedModes."""
+    """Kind of a TPM. Its modes are WorkingModes, and AssemblyModes or RotatedModes."""
 
     lists: Mapping[str, str] = {
         "Operation": "Link 3' only translates, or is turned about y",
@@ -52,7 +52,10 @@ class TPMKind(Kind):
     machine: TPM
 
     def __init__(self, machine: TPM) -> None:
-        """Show a TPM. In its own working mode the elbows are out."""
+        """Store the machine, and label its working modes.
+
+        The label of an elbow is "out" if it is bent as in the machine's working mode, else "in".
+        """
         super().__init__(machine)
         self.working = {
             (words, side): kinematics.WorkingMode(cos_beta, *signs)
@@ -138,7 +141,7 @@ class TPMKind(Kind):
     # -- layers -------------------------------------------------------------------------------
 
     def layers(self, posture: Posture) -> Mapping[str, Found]:
-        """See :class:`Kind`; layers are those of the translating operation mode."""
+        """See :class:`Kind`; only the translating operation mode has layers."""
         if posture.operation == "rotated":
             return {}
         working, assembly = posture.working, posture.assembly
@@ -148,7 +151,7 @@ class TPMKind(Kind):
             return working, lambda: {name: surface(name, working, g) for name in factors}
 
         def found_aspects() -> list[Cells]:
-            """Find the aspects on P's side of y = 0; the others are their mirror images."""
+            """Find the aspects on P's side of y = 0; the other side has their mirror images."""
             return [a.cells for a in aspects(working, g) if a.assembly.sin_beta == side]
 
         def quality(points: FloatArray) -> FloatArray:

@@ -44,7 +44,7 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 _UP: Vector = (0.0, 0.0, 1.0)
 
 _Place = tuple[int, int]
-"""Index of a contact, and its slot."""
+"""Index of a contact in the list, and its slot: the index of its force of the last time step."""
 _Pair = tuple[tuple[int, int], float]
 """Indices of the bodies a and b, and the Coulomb coefficient between them."""
 
@@ -88,7 +88,8 @@ def _add(
 ) -> int:
     """Write a contact; return the new number of contacts.
 
-    The first two rows of ``arms`` become ``arm_a`` and ``arm_b``; the third row is not used.
+    The first two rows of ``arms`` are the lever arms (m) of the contact on bodies a and b. They
+    become ``arm_a`` and ``arm_b``; the third row is not used.
     """
     contact = contacts[place[0]]
     contact["slot"] = place[1]
@@ -148,7 +149,10 @@ def collide_objects(
 def _collide_table(
     box: _Box, setting: Setting, contacts: Records, place: _Place, body: tuple[int, float]
 ) -> int:
-    """Add contacts of corners with table or belt; with the floor if the centre is over neither."""
+    """Add contacts of a box's corners with the table or belt.
+
+    If the box's centre is over neither of them, add contacts with the floor instead.
+    """
     (x, y, z), (count, slot), (low, high, edge) = box.middle, place, setting.table
     over = low <= x <= high and abs(y) <= edge
     height = z - (TABLE.top if over else FLOOR.top)
@@ -247,7 +251,7 @@ def _nearest(box: _Box, lip: Vector) -> Vector:
 def _press_edge(box: _Box, lip: Vector, contacts: Records, place: _Place, pair: _Pair) -> int:
     """Add contacts of the lip with the uppermost edge of a tilted object.
 
-    They are the two ends of the part of the edge that is below the lip.
+    The contacts are at the two ends of the part of the edge that is below the lip.
     """
     (u, v, w), (p, q, r), low = box.frame, box.half, 0
     for k in range(1, 3):
@@ -390,8 +394,8 @@ def _clip_face(
 ) -> int:
     """Add contacts at the corners of the overlap of two faces that face each other.
 
-    They are a face of ``plane``, whose normal is axis ``face``, and a face of ``other``. ``sign``
-    is 1 if ``plane`` is body a of the pair, and -1 if it is body b.
+    One face belongs to ``plane``; its normal is axis ``face`` of ``plane``. The other face belongs
+    to ``other``. ``sign`` is 1 if ``plane`` is body a of the pair, and -1 if it is body b.
     """
     away, facing = plus(other.middle, plane.middle, -1.0), 0
     normal = plus(_ZERO, plane.frame[face], math.copysign(1.0, dot(plane.frame[face], away)))
@@ -421,7 +425,10 @@ def _clip_face(
 
 @compiled
 def _cut(points: FloatArray, kept: FloatArray, number: int, side: Vector, edge: float) -> int:
-    """Clip a polygon to distances up to ``edge`` along ``side``; return the number of corners."""
+    """Keep the part of a polygon with coordinates up to ``edge`` (m) along the direction ``side``.
+
+    Write the corners of this part to ``kept``; return their number.
+    """
     left = 0
     for k in range(number):
         here, there = three(points[k]), three(points[(k + 1) % number])

@@ -87,8 +87,8 @@ class Contact:
     def place(self, rows: IntArray, poses: FloatArray) -> None:
         """Release held objects, set vacuum to zero, and place all objects without motion.
 
-        Tables whose objects all stand upright on the table top are at rest at once, unless their
-        belt runs.
+        If all objects of a table stand upright on the table top, and its belt does not run, they
+        count as at rest immediately.
 
         Args:
             rows: (r,) indices of the tables.

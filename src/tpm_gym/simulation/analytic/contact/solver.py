@@ -63,7 +63,10 @@ def _reply(body: Record, arm: Vector, impulse: Vector) -> Vector:
 
 @compiled
 def _trace(body: Record, arm: Vector) -> float:
-    """Return the trace of the matrix (1/kg) from an impulse at a point to the velocity there."""
+    """Return the trace of a matrix, 1/kg.
+
+    The matrix maps an impulse at a point of the body to the change of the point's velocity.
+    """
     x, y, z = three(body["lightness"])
     turn = cross(arm, three(body["axis"]))
     spread = 2 * body["across"] * dot(arm, arm)
@@ -183,8 +186,8 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
         count: Number of contacts.
         bodies: Bodies of the contacts; their velocities are changed.
         motor: Spring that drives body 0, the cup.
-        calm: Whether to stop as soon as all objects are :func:`still`: the impulses balance all
-            forces at that moment.
+        calm: Whether to stop as soon as all objects are :func:`still`, because the impulses then
+            balance all forces.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
     for sweep in range(_SWEEPS):

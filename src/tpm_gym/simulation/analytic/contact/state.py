@@ -88,7 +88,8 @@ class Setting(NamedTuple):
         table: Lowest and highest x of table and belt, and half their width, m.
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
-        turn: Factors (1 or -1) of the machine's axes in the world frame.
+        turn: Signs (1 or -1). The components of a vector in the machine's frame times these signs
+            are its components in the world frame.
         origin: Origin of the machine's frame in the world frame, m.
     """
 

@@ -35,10 +35,10 @@ _LEVEL = 1e-9  # m; largest distance from the table top of an object that stands
 _NEARBY = 5e-4  # m; margin for contacts of the lip, beyond its motion in a time step
 _BESIDE = 0.005  # m; a table is not skipped if the lip may come closer to an object
 _FREE_CUP = 4 * CUP_MASS
-"""Inertia of an empty cup, kg.
+"""Mass of an empty cup in the solver, kg.
 
-It is larger than the true mass and similar to an object's mass: then the solver converges several
-times faster. The spring can accelerate this mass at 300 m/s^2.
+It is larger than the cup's true mass and similar to an object's mass, so that the solver converges
+several times faster. The spring can accelerate this mass at 300 m/s^2.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
@@ -232,7 +232,7 @@ def _beside(item: Record, size: float, path: Route, i: int, setting: Setting) ->
 
 @compiled
 def _range(path: Route, i: int, axis: int, setting: Setting) -> tuple[float, float]:
-    """Return lowest and highest coordinate (m, world) of point P and its control points."""
+    """Return the lowest and highest coordinate (m, world) of P and of the path's control points."""
     turn, origin = setting.turn[axis], setting.origin[axis]
     low = high = turn * path.now[i, axis] + origin
     for j in range(path.controls.shape[1]):
