@@ -57,7 +57,7 @@ class EvaluationConfig:
     policy: Annotated[tuple[str, ...], tyro.conf.arg(metavar="POLICY ...")]
     """expert, random, the id of a published policy, an exported policy or the folder of a run."""
 
-    env: Annotated[str, unset(str, "the policy's, unless that is module:id", "ID")] = UNSET
+    env: Annotated[str, unset(str, "the policy's; a module:id must be given", "ID")] = UNSET
     """Environment id, or module:id if a module of yours registers it. It must be given if the
     policy was trained in module:id, because importing a module runs its code."""
 
