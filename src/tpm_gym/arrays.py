@@ -118,7 +118,7 @@ def finite_points(name: str, value: ArrayLike) -> FloatArray:
 
 
 def first_row(points: FloatArray, chosen: BoolArray) -> Vector:
-    """Return the first of points (..., 3) that is chosen (...,), as plain floats."""
+    """Return the first of ``points`` (..., 3) for which ``chosen`` (...,) is true, as floats."""
     x, y, z = points[chosen][0].tolist()
     return x, y, z
 

@@ -232,7 +232,7 @@ def require_shape(shape: object, least: int) -> None:
 def _codes(
     branch: WorkingMode, geometry: Geometry, shape: Shape, limits: tuple[Limit, ...]
 ) -> tuple[Vector, Vector, IntArray]:
-    """Return corner and spacing of the grid, and the signs at the centres of its cells."""
+    """Return corner and spacing of the grid, and :func:`_signs` at the centres of its cells."""
     require_shape(shape, 2)
     if shape[1] % 2:
         raise ConfigurationError("shape", shape, "an even number along y")
@@ -253,10 +253,11 @@ def _codes(
 def _signs(
     points: FloatArray, branch: WorkingMode, geometry: Geometry, limits: tuple[Limit, ...]
 ) -> IntArray:
-    """Return the signs of four singular factors as bits; -1 out of reach or beyond a limit.
+    """Return an integer for each point, whose bits are the signs of four singular factors.
 
     The bits 1, 2, 4 and 8 are set where ``sin_beta``, ``level3``, ``planar`` and ``elevation`` of
-    :class:`~tpm_gym.kinematics.Factors` are positive.
+    :class:`~tpm_gym.kinematics.Factors` are positive. The integer is -1 for points that are out of
+    reach or beyond a limit.
     """
     found = factors_at(points, branch, geometry)
     values = np.stack([found.sin_beta, found.level3, found.planar, found.elevation], axis=-1)
@@ -292,7 +293,10 @@ def components(codes: IntArray) -> IntArray:
 
 
 def _grown(mask: BoolArray, corners: bool = True) -> BoolArray:
-    """Return a set of cells with its neighbours at faces; with ``corners``, at corners too."""
+    """Return a set of cells, extended by all cells that share a face with it.
+
+    If ``corners``, it is extended by all cells that share at least a corner with it.
+    """
     grown: BoolArray = mask.copy()
     for before, after in _NEIGHBOURS:
         reached = grown.copy() if corners else mask

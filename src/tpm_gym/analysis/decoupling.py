@@ -74,7 +74,9 @@ def over(
     geometry: Geometry = PAPER,
     shape: tuple[int, int, int] = (9, 9, 9),
 ) -> Index:
-    """Average shares and numbers of motors over a grid of ``shape`` in a region, for x, y, z of P.
+    """Compute the averages of :func:`shares` and :func:`motors` in a region, for x, y, z of P.
+
+    The averages are over a grid with ``shape`` points along x, y, z.
 
     Raises:
         UnreachableError: If a point is out of reach.

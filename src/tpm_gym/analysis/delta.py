@@ -33,8 +33,9 @@ def chains(
         theta: Joint positions.
         side: Assembly mode, the sign of det A.
         geometry: Lengths.
-        balls: True for legs of a motor and a parallelogram of balls, as the package's Delta has.
-            False for legs of a motor, R, a parallelogram of revolutes, and R.
+        balls: If True, each leg consists of a motor and a parallelogram with ball joints, as in the
+            package's Delta. If False, it consists of a motor, a revolute, a parallelogram with
+            revolutes, and another revolute.
 
     Raises:
         InputError: If theta is not three finite numbers.
@@ -119,9 +120,11 @@ def aspects(
 def _codes(
     bends: Triple, geometry: DeltaGeometry, shape: Shape, within_stops: bool
 ) -> tuple[Triple, Triple, IntArray]:
-    """Return corner and spacing of the grid, and the signs at the centres of its cells as bits.
+    """Return corner and spacing of the grid, and an integer for each cell.
 
-    The entry of a cell is -1 if its centre is out of reach or beyond a stop.
+    The bits 1 and 2 are set where det A and det [n1 n2 n3] (see :class:`Aspect`) are positive at
+    the centre of the cell. The integer is -1 if the centre is out of reach or, with
+    ``within_stops``, beyond a stop.
     """
     require_delta(geometry)
     require_shape(shape, 2)

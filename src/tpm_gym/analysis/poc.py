@@ -127,7 +127,10 @@ class Unit:
         return len(self.translations) + len(self.rotations)
 
     def poc(self, base_point: ArrayLike) -> POCSet:
-        """Return M_Ji of Eq. (1) about ``base_point`` (3,) m of the chain's end link."""
+        """Return the POC set of this unit, M_Ji of Eq. (1).
+
+        ``base_point`` (3,) m is the base point of the chain's end link.
+        """
         arm = finite("base_point", base_point, (3,)) - self.point
         carried = np.concatenate([self.translations, np.cross(self.rotations, arm)])
         return POCSet(Subspace.span(carried), Subspace.span(self.rotations))
@@ -146,9 +149,9 @@ def prismatic(name: str, axis: FloatArray, point: FloatArray, actuated: bool = F
 def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four spherical pairs, the paper's P^(4S) P^(4S) R^(4S) R^(4S).
 
-    The short links are parallel to ``short`` (3,), the rods to ``rod`` (3,). The far short link,
-    with its middle at ``point`` (3,) m, cannot translate along ``rod``, nor rotate about the normal
-    of ``short`` and ``rod``.
+    The short links are parallel to ``short`` (3,), the rods to ``rod`` (3,). ``point`` (3,) m is
+    the middle of the short link at the far end of the rods. This short link cannot translate along
+    ``rod``, nor rotate about the normal of ``short`` and ``rod``.
     """
     normal = np.cross(short, rod)
     translations = np.stack([normal, np.cross(rod, normal)])
@@ -158,9 +161,9 @@ def parallelogram_4s(name: str, short: FloatArray, rod: FloatArray, point: Float
 def parallelogram_4r(name: str, short: FloatArray, rod: FloatArray, point: FloatArray) -> Unit:
     """Return a parallelogram of four revolutes, P^(4R); arguments as in :func:`parallelogram_4s`.
 
-    The far short link translates in the plane of the parallelogram, perpendicular to the rods. The
-    paper writes t^1(|| R32), a translation along the short links. This is exact only if the rods
-    are perpendicular to the short links.
+    The short link at the far end of the rods translates in the plane of the parallelogram,
+    perpendicular to the rods. The paper writes t^1(|| R32), a translation along the short links.
+    The paper's direction is exact only if the rods are perpendicular to the short links.
     """
     return Unit(name, point, np.cross(rod, np.cross(short, rod))[None], np.empty((0, 3)))
 
@@ -183,7 +186,10 @@ class Chain:
         return sum(unit.actuated for unit in self.units)
 
     def poc(self, base_point: ArrayLike) -> POCSet:
-        """Return the POC set of the chain, Eq. (1), about ``base_point`` (3,) m of its end link."""
+        """Return the POC set of the chain, Eq. (1).
+
+        ``base_point`` (3,) m is the base point of the chain's end link.
+        """
         return serial([unit.poc(base_point) for unit in self.units])
 
 
@@ -244,7 +250,10 @@ class Loop:
 
     @property
     def constraint(self) -> int:
-        """Constraint degree, Delta_j = sum of f_i - I_j - xi_Lj; the paper's second Eq. (4)."""
+        """Constraint degree, Delta_j = sum of f_i - I_j - xi_Lj.
+
+        It is the second of the paper's two equations with the number (4).
+        """
         return self.freedoms - self.actuated - self.equations
 
 
@@ -275,7 +284,10 @@ class ParallelMechanism:
         return coupling_degrees([[x.constraint for x in loops] for loops in self.decompositions])
 
     def dof(self, loops: int | None = None) -> int:
-        """Return F = sum f_i - sum xi_Lj, Eq. (3a), of the first ``loops`` loops; None for all."""
+        """Return the degrees of freedom F = sum f_i - sum xi_Lj, Eq. (3a).
+
+        ``loops`` is the number of loops in the sums, counted from the first; None for all loops.
+        """
         return sum(loop.freedoms - loop.equations for loop in self.loops[:loops])
 
 

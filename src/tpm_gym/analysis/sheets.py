@@ -22,12 +22,13 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
 
 Point = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""xC and zC in m, and two numbers p and q. The point belongs to the working mode if
-p + q cos(beta) > 0 and cos(beta) has the sign of the mode."""
+"""xC and zC in m, and two numbers p and q, which the curve computes for its working mode. P belongs
+to the working mode if p + q cos(beta) > 0 and cos(beta) has the sign ``cos_beta`` of the mode."""
 Curve = Callable[[Geometry, WorkingMode, FloatArray, FloatArray, FloatArray], Point]
-"""Point of a curve, as a function of lengths, mode, angle, and two signs that select a branch."""
+"""Function that returns points of a curve. Its arguments are the lengths, the working mode, the
+angle, and two signs that select a branch of the curve."""
 
-_CELLS = 256  # cells of an arc
+_CELLS = 256  # cells of an arc: equal steps of the ``t`` of _Arcs.at()
 _FINE = 4 * _CELLS  # chords that measure the length of an arc
 _NODES, _ROUNDS = 9, 16  # each round keeps a quarter of the interval
 _GRID = 2048  # cells of a full turn in the search for intervals
@@ -54,9 +55,9 @@ def _tangent(
     """Return x, z and length of the vector A2B1, and the coordinate of B2 along rod 6, m.
 
     The coordinate is measured from B1, and is never positive. All values are for a view along y at
-    theta_1 = ``t``, with leg 2 moved so that C2 is at C1. If the planar factor is zero, rods 4 and
-    6 lie on one line, and the coordinate's absolute value is the side B1B2 of the triangle A2B1B2.
-    ``side`` is -1 if the rods point in opposite directions.
+    theta_1 = ``t``. Leg 2, with A2, is shifted so that C2 is at C1. If the planar factor is zero,
+    rods 4 and 6 then lie on one line, and the coordinate's absolute value is the distance from B1
+    to B2 in the triangle A2B1B2. ``side`` is -1 if the rods point in opposite directions, else 1.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
     rod = side * np.sqrt(np.maximum(_rod_4(g, t)[1], 0.0))
@@ -128,8 +129,8 @@ class _Arcs:
 
     Attributes:
         curve: Function that gives the points.
-        first: (n,) first sign.
-        second: (n,) second sign.
+        first: (n,) first of the two signs for ``curve``.
+        second: (n,) second of the two signs for ``curve``.
         middle: (n,) rad, middle of the interval of the angle.
         half: (n,) rad, half the length of the interval.
     """
@@ -143,9 +144,14 @@ class _Arcs:
     half: FloatArray
 
     def at(self, arc: IntArray, t: FloatArray) -> Point:
-        """Return points at ``t`` (k, ...), from 0 to pi, of arcs (k,)."""
+        """Return points of k arcs.
+
+        Args:
+            arc: (k,) indices of the arcs.
+            t: (k, ...) places on the arcs: 0 at the start of an arc, pi at its end.
+        """
         arc = arc.reshape(-1, *[1] * (t.ndim - 1))
-        # t runs from 0 to pi, so that the curve is smooth at both ends.
+        # As a function of t instead of the angle, the curve is smooth at both ends.
         angle = self.middle[arc] - self.half[arc] * np.cos(t)
         signs = self.first[arc] + 0 * t, self.second[arc] + 0 * t
         return self.curve(self.geometry, self.mode, angle, *signs)
@@ -153,7 +159,12 @@ class _Arcs:
 
 @lru_cache(maxsize=64)
 def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Point, FloatArray]:
-    """Return n arcs, points (n, cells + 1), and the lengths (n, cells) m of the arcs' cells."""
+    """Return the n arcs of a factor, each divided into cells.
+
+    Returns:
+        The arcs, the points (n, cells + 1) at the ends of cells, and the lengths (n, cells) m of
+        cells.
+    """
     rows = [
         (first, second, (low + high) / 2, (high - low) / 2)
         for first in (-1, 1)
@@ -266,14 +277,14 @@ def _feet(
         (c, 3) m.
     """
     arcs, (x, z, p, q), length = _arcs(g, mode, name)
-    link3 = points - [g.l2, 0, 2 * g.l6]  # C1 for a link 7 of length 0
+    link3 = points - [g.l2, 0, 2 * g.l6]  # C1 if link 7 had length 0
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the distances of points ``rows`` (..., 3) m to circles, and to their centres.
+        """Return three distances of the points ``rows`` (..., 3) m from circles, m.
 
-        The circles have the centres (x, 0, z) and the radius l7, and are parallel to xy. There are
-        two distances to a centre: the signed distance along x, and the distance in a projection on
-        xy.
+        The circles have the centres (x, 0, z) and the radius l7, and are parallel to xy. The
+        distances are: from the circle; from its centre, along x and with sign; from its centre, in
+        a projection on xy.
         """
         level = rows[..., 0] - x
         radius = np.hypot(level, rows[..., 1])
@@ -294,7 +305,10 @@ def _feet(
     low, all_ = cell.astype(np.float64) * step, np.arange(len(cell))
 
     def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
-        """Return points at t (k, ...) of cells (k,), and the results of offset() and belongs()."""
+        """Return points of k cells, and the results of offset() and belongs() for these points.
+
+        ``cells`` (k,) are indices of ``cell``, and ``t`` (k, ...) is as in :meth:`_Arcs.at`.
+        """
         point, rows = arcs.at(arc[cells], t), link3[row[cells]]
         found = offset(rows[:, None] if t.ndim > 1 else rows, *point[:2])
         return point, found, belongs(point, *found[1:])

@@ -34,7 +34,8 @@ from tpm_gym.kinematics.modes import (
 )
 
 FACTORS = equations.Factors._fields
-"""Names of the factors, in the order of every axis of length 8: 3 parallel, 4 serial, elevation."""
+"""Names of the eight factors: 3 parallel, 4 serial, elevation. Arrays (..., 8) of factors, as in
+:class:`Classification`, have this order along the last axis."""
 
 _SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = map(
     FACTORS.index, ("sin_beta", "planar", "cos_beta", "leg3")

@@ -73,7 +73,11 @@ def describe(
         return tuple(found)
 
     def sides(near: str, far: str, other: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return short link, rod, and middle of the far short link of a parallelogram."""
+        """Return vectors along short link and rod of a parallelogram, and a point, (3,) m each.
+
+        The point is the middle of the short link at the far end of the rods. This short link's
+        vector is from ``other`` to ``far``, the rod's vector from ``near`` to ``far``.
+        """
         foot = axes[near][0].origin
         return ends[far] - ends[other], ends[far] - foot, (ends[far] + ends[other]) / 2
 
@@ -93,10 +97,14 @@ def describe(
 
 @dataclass(frozen=True, eq=False)
 class Topology(poc.ParallelMechanism):
-    """Result of :func:`analyse`. The paper's decomposition (I and II, then III) comes first.
+    """Result of :func:`analyse`.
+
+    The first entry of ``decompositions`` is the paper's: the first loop consists of branches I and
+    II, and branch III with the wrist closes the second loop.
 
     Attributes:
-        sub_mechanism: M_Pa(1-2) of the paper's first Eq. (4): POC set of link 3' on branches I, II.
+        sub_mechanism: POC set of link 3' on branches I and II. The paper calls it M_Pa(1-2), in the
+            first of its two equations with the number (4).
         hsoc_1: POC set of the platform on branches I and II with R12, R13.
         hsoc_2: POC set of the platform on branch III.
     """

@@ -63,7 +63,7 @@ class EnvSnapshot:
     """Everything that the next steps of n environments depend on.
 
     Attributes:
-        kind: Task and options, which must be equal where the snapshot is restored.
+        kind: Task and options. Environments with other values cannot restore the snapshot.
         simulation: The simulation's part.
         rngs: States of the n generators.
         columns: Arrays by name: goals and delayed actions. Vector environments add the lengths
@@ -413,10 +413,12 @@ class Core:
             self.simulation.close()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything, for :func:`copy.deepcopy` and :mod:`pickle`, in an episode too.
+        """Return the attributes for :func:`copy.deepcopy` and :mod:`pickle`, during episodes too.
+
+        A snapshot of the simulation replaces the simulation; it is None if no episode is running.
 
         Raises:
-            ConfigurationError: With a window: PyBullet opens only one in a process.
+            ConfigurationError: If there is a window: PyBullet opens only one in a process.
         """
         if self._engine["gui"]:
             valid = "None or 'rgb_array' for an environment that is copied or pickled"
@@ -442,13 +444,13 @@ def _as_in_json(physics: Any) -> Any:
 
 
 def _view(state: State) -> FloatArray:
-    """Return the camera's view of the objects, (n, k, 9): position, axis, velocity."""
+    """Return what a camera measures of k objects, (n, k, 9): position, z axis, velocity."""
     parts = state.object_position, state.object_axis, state.object_velocity
     return np.concatenate(parts, axis=2)
 
 
 def _seen(state: State, view: FloatArray) -> State:
-    """Return a copy of a state with the objects of a camera's view (n, k, 9)."""
+    """Return a copy of a state in which the objects are as in ``view``, from :func:`_view`."""
     position, axis, velocity = np.split(view, 3, axis=2)
     return replace(state, object_position=position, object_axis=axis, object_velocity=velocity)
 

@@ -35,7 +35,8 @@ from tpm_gym.tasks.control import Control, Follower
 __all__ = ["BrakingShield", "Shield", "make_shield"]
 
 MARGIN = 0.15
-"""Extra conditioning for servo drives or randomised plants, as a fraction of the safe value."""
+"""Extra conditioning that shields keep with servo drives or randomised plants, as a fraction of the
+machine's ``safe_conditioning``."""
 TOLERANCE = 2e-5
 """Amount by which the conditioning at commands should exceed ``least``.
 
@@ -258,11 +259,12 @@ def make_shield(
     """Return the shield of an environment's option.
 
     Args:
-        shield: True, or the conditioning to keep.
+        shield: The conditioning to keep, or True for the machine's ``safe_conditioning``.
         machine: Nominal machine.
         control: Control of the environment.
         follower: Limit of the control's commands, if their accelerations are bounded.
-        exact: Whether the robot follows its commands exactly. If not, True adds the ``MARGIN``.
+        exact: Whether the robot follows its commands exactly. If it does not, ``shield=True`` adds
+            the fraction :data:`MARGIN` to the conditioning to keep.
 
     Raises:
         ConfigurationError: If the option is neither True nor a number in (0, 1], if the

@@ -96,7 +96,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_offset | 3 | top of the object minus lip of the cup |
     | object_velocity | 3 | velocity of the object, from a camera |
     | object_tilt | 2 | x and y of the object's axis |
-    | object_held | 1 | vacuum from 0 to 1, by a gauge, if the object is held |
+    | object_held | 1 | vacuum by a gauge, from 0 to 1; 0 if the object is not held |
 
     The entries of the object are repeated for each object. Push adds the object's turn about the
     vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,
@@ -147,8 +147,9 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | the episode's plant; only from reset(), with the option of this name |
 
-    Crossing adds ``crossed``: whether P is on the other side of y = 0 than home. Push adds
-    ``toppled``: whether the block lies on a side.
+    Here y is in the paper's frame, and l7 is the length of link 7. Crossing adds ``crossed``:
+    whether P is on the other side of y = 0 than home. Push adds ``toppled``: whether the block lies
+    on a side.
 
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 
@@ -171,7 +172,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             has registered, or a :class:`~tpm_gym.Machine`; a spec that is written as JSON needs a
             name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
-            a singularity; only for machines whose goals are near a singularity.
+            a singularity. This is possible only if the machine's region for goals has such places.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
             100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references. It
@@ -180,9 +181,9 @@ class TPMEnv(gym.Env[Observation, Action]):
             zero at 25 rad/s. For a servo drive with other parameters, give a
             :class:`~tpm_gym.simulation.Servo` or a mapping of its attributes.
         randomisation: Differences from the nominal machine, drawn for each episode: a
-            :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. Position and
-            velocity keep their last values while disturbed encoders report joint positions that
-            cannot be assembled.
+            :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. If disturbed
+            encoders report joint positions at which the mechanism cannot be assembled, the
+            observation uses the last valid position of P and the last valid J.
         shield: Whether each action is replaced by the nearest one that keeps the conditioning at
             the machine's ``safe_conditioning`` or above, over the whole control period. With servo
             drives or randomisation, True keeps 15% more. A number is the conditioning to keep.
@@ -354,7 +355,7 @@ class TPMEnv(gym.Env[Observation, Action]):
             info: The step's info, or one for each transition of the batch.
 
         Returns:
-            A float, or (...,) of them.
+            The reward, a float; for a batch, an array (...,) of rewards.
 
         Raises:
             InputError: If the goals are no real numbers of these shapes, or ``info`` does not fit.

@@ -44,16 +44,17 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     """n environments that are stepped together.
 
     Spaces, rewards, seeds and infos are as in :class:`~tpm_gym.TPMEnv`. In the analytic engine, the
-    results of an environment agree in every bit, whatever the number of environments and threads.
+    results of an environment do not depend, in any bit, on the number of environments and threads.
     Infos have the form of Gymnasium's vector environments, with a mask ``_key`` for each ``key``.
 
     Args:
         task: See :class:`~tpm_gym.TPMEnv`.
-        control: See there.
-        reward: See there.
+        control: See :class:`~tpm_gym.TPMEnv`.
+        reward: See :class:`~tpm_gym.TPMEnv`.
         num_envs: Number of environments, n.
-        engine: See there. ``"analytic"`` computes all environments together. With other engines,
-            each environment has its own engine, and they are stepped one after another.
+        engine: See :class:`~tpm_gym.TPMEnv`. ``"analytic"`` computes all environments together.
+            With other engines, each environment has its own engine, and the environments are
+            stepped one after another.
         num_threads: Threads that step the environments of the analytic engine.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         autoreset_mode: When environments whose episode ended are reset: ``NEXT_STEP``,
@@ -61,7 +62,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a full reset have different lengths, so that
             they do not all end at the same step. This makes on-policy batches more even.
-        render_mode: See there, but not ``"human"``.
+        render_mode: As in :class:`~tpm_gym.TPMEnv`, but not ``"human"``.
         options: Other options of :class:`~tpm_gym.TPMEnv`.
 
     Raises:
@@ -135,7 +136,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         return ThreadPoolExecutor(self._threads) if self._threads > 1 else None
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything except the threads, for :func:`copy.deepcopy` and :mod:`pickle`."""
+        """Return the attributes without threads, for :func:`copy.deepcopy` and :mod:`pickle`."""
         return {**vars(self), "_pool": None}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
@@ -325,7 +326,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     @property
     def kind(self) -> Mapping[str, Any]:
-        """Task and options, which must be equal where a snapshot is restored."""
+        """Task and options. Snapshots of environments with other values cannot be restored."""
         return self._parts[0].core.kind
 
     @property
@@ -371,10 +372,10 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
 
 class _Part:
-    """Environments of one core, with the lengths of their episodes and their autoreset.
+    """Part of a vector environment: the environments of one :class:`Core`, with their autoreset.
 
     Attributes:
-        core: The environments.
+        core: Core that runs these environments.
         elapsed: (n,) steps of the episodes so far.
         ended: (n,) whether an environment needs a reset.
     """
@@ -457,7 +458,7 @@ class _Part:
         }
 
     def require_equal(self, snapshot: Any) -> None:
-        """Raise InputError unless ``snapshot`` is of an equal part of a vector environment."""
+        """Raise InputError unless ``snapshot`` is from a part of equal size, task and options."""
         self.core.require_equal(snapshot)
         if "elapsed" not in snapshot.columns:
             valid = "from save_state() of a vector environment, which counts steps"
@@ -472,7 +473,11 @@ class _Part:
 
 
 def _sizes(count: int, most: int | None, threads: int) -> list[int]:
-    """Return how many environments each core gets."""
+    """Divide ``count`` environments into parts, and return the sizes of the parts.
+
+    ``most`` is the largest size of a part. If it is None, there are as many parts as ``threads``,
+    but at most ``count``.
+    """
     parts = min(threads, count) if most is None else -(-count // most)
     return [count // parts + (k < count % parts) for k in range(parts)]
 

@@ -4,8 +4,8 @@ The paper's frame O-xyz has its origin in the middle of the base. The base lies 
 and z points from the base towards the platform. Units are metres and radians. The mechanism has two
 loops of coupling degree zero, so forward and inverse kinematics reduce to intersections of circles.
 The intersections are computed with vectors, or from equations ``a cos + b sin = c``. The paper's
-half-angle forms (Eqs. 13 and 15) are not used, because they fail where ``g_i = 0`` or
-``theta_i = pi``.
+half-angle forms (Eqs. 13 and 15), quadratic equations in tan(theta_i / 2), are not used. They fail
+where theta_i = pi, or where the coefficient of the squared tangent (the paper's g_i) is zero.
 
 The functions compute with the numbers of their namespace ``ns``: arrays and tensors
 (:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code
@@ -33,9 +33,9 @@ Where two solutions merge, rounding can make it negative although the solutions 
 _REACH = 1.0 + ROUNDING
 SINGULAR = 1e-6
 """Limit below which a factor of det A, divided by lengths, counts as zero. With the paper's
-lengths, sin(beta) is below this limit where P is less than 50 nm from y = 0. cos(beta) has an error
-of about 1e-14. So near cos(beta) = 1, sin(beta) has an error of about 1e-7, which is below the
-limit."""
+lengths, sin(beta) is below this limit where P is less than 50 nm from y = 0. sin(beta) is computed
+from cos(beta), whose error is about 1e-14. So where sin(beta) is almost zero, its error is about
+1e-7, which is below the limit."""
 LEAST = 1e-30
 """Smallest det A, m^3, for which the conditioning is computed. For a smaller det A, terms of the
 conditioning could overflow."""
@@ -118,7 +118,10 @@ def arms(theta: Triple, g: LegLengths, ns: Namespace) -> tuple[Triple, Triple]:
 def assembly_at(
     cos: Triple, sin: Triple, planar: Numbers, side: Numbers, g: AnyLengths, ns: Namespace
 ) -> tuple[Assembly, Numbers, tuple[Numbers, Numbers, Numbers, Numbers, Numbers]]:
-    """Solve forward kinematics (Eqs. 6 to 11, corrected) for signs of planar factor and sin(beta).
+    """Solve forward kinematics (Eqs. 6 to 11, corrected) in a given assembly mode.
+
+    The sign of the planar factor is ``planar``, and the sign of sin(beta) is ``side``. ``cos`` and
+    ``sin`` are from :func:`arms`.
 
     Eq. (6): in the plane y = 0, C1 is on two circles. With the elbow B1 at (0, y1, z1), the first
     circle has the centre (0, z1) and radius^2 = l4^2 - y1^2. The second circle has the radius l4.
@@ -134,8 +137,8 @@ def assembly_at(
           real, then a2 = b2 = 0 in Eq. (10), and rod 11 fits for every beta;
         * y1, m;
         * the squared distance of the circles' centres, m^2;
-        * for a link 7 of length 0, the horizontal distance from B3 to C3, m;
-        * for a link 7 of length 0, the vertical distance from B3 to C3, m.
+        * the horizontal distance from B3 to C3 that a link 7 of length 0 would give, m;
+        * the vertical distance from B3 to C3 that a link 7 of length 0 would give, m.
     """
     l4, l7 = g.l4, g.l7
     y1, z1 = g.l1 + cos[0], sin[0]
@@ -167,7 +170,7 @@ def assembly_at(
 def posture_at(
     point: Triple, signs: tuple[Numbers, ...], g: AnyLengths, ns: Namespace
 ) -> tuple[Triple, Numbers, _Four, _Four]:
-    """Solve inverse kinematics (Eqs. 12 to 15, corrected) for the signs of a working mode.
+    """Solve inverse kinematics (Eqs. 12 to 15, corrected) in the working mode with given ``signs``.
 
     Returns:
         Four results, in this order.

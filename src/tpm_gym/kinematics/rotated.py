@@ -308,8 +308,8 @@ def _refined(
 def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar, FloatArray]:
     """Sort solutions into four slots; slots without a solution are NaN.
 
-    The half with the smaller ``sign`` gets the first two slots, the other half the last two. In
-    each half, the tilts in [0, 2 pi) are ascending.
+    Half of the solutions, those with the smaller values of ``sign``, get the first two slots. The
+    other solutions get the last two. In each half, the tilts in [0, 2 pi) are ascending.
     """
     real = ~np.isnan(sign)
     count = real.sum(axis=-1, keepdims=True)

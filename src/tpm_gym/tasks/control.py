@@ -84,7 +84,7 @@ class CartesianControl:
         return points / self._step
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Return diagonal matrices of the step limit."""
+        """Return for each point the diagonal matrix of the step limits along x, y and z, m."""
         return np.tile(np.diag(self._step), (len(points), 1, 1))
 
 

@@ -66,7 +66,7 @@ def timed(
 
 
 def _spans(squared: FloatArray) -> FloatArray:
-    """Return the times (N,) from point to point, for b (N + 1,) at the points."""
+    """Return the times (N,) s from point to point; ``squared`` (N + 1,) is (ds/dt)^2 at points."""
     speed = np.sqrt(squared)
     spans: FloatArray = 2 / (len(squared) - 1) / (speed[1:] + speed[:-1])
     return spans
@@ -84,7 +84,7 @@ def _cost(squared: FloatArray, begin: FloatArray, end: FloatArray) -> float:
 
 
 def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Return b (N + 1,), zero at both ends, with the least time plus heat (Newton's method)."""
+    """Minimise time plus heat by Newton's method; return (ds/dt)^2 (N + 1,), zero at both ends."""
     s = np.linspace(0.0, 1.0, len(begin) + 1)
     squared = s * (1 - s)
     heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
@@ -109,7 +109,7 @@ def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
 def _derivatives(
     squared: FloatArray, begin: FloatArray, end: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in the inner values of b."""
+    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in ``squared[1:-1]``."""
     count, spans, torques = len(begin), _spans(squared), _torques(squared, begin, end)
     speed = np.sqrt(squared)
     weight = 1 + (torques**2).sum(axis=1)

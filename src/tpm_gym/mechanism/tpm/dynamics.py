@@ -11,8 +11,9 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
 
 * the arms turn about the motors' axes;
 * a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points. Rods 4 and 11
-  also turn about their own axes as they swing. The inertia of the swing contains the inertia of
-  this turning, of the crosses of rods 4, and of end link 9;
+  also turn about their own axes as they swing. The inertia of a swing includes this turning, and
+  the bodies that swing with the rods: end link 9 with rods 11, and with rods 4 the crosses (the
+  middle pieces of the universal joints at arm 2);
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z. It is a bar between C1 and P, except for constant offsets;
 * platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
