@@ -62,9 +62,10 @@ def parallel(
 ) -> FloatArray:
     """Compute the parallel Jacobian A of A v = B theta_dot, (..., 3, 3) m.
 
-    Eliminating the passive angle beta through y = l7 sin(beta) gives dxC = dx + tan(beta) dy. Rows
-    1 and 2 are multiplied by cos(beta), which keeps A finite at y = +-l7. So det A = -cos(beta)
-    times the product of the factors of Eq. (16).
+    Point P is (x, y, z). Eliminating the passive angle beta through y = l7 sin(beta) gives
+    dxC = dx + tan(beta) dy, and tan(beta) is infinite at y = +-l7. To keep A finite, rows 1 and 2
+    are multiplied by cos(beta). With these rows, det A is -cos(beta) times the product of the
+    factors of Eq. (16).
     """
 
     def results(c: _Configuration) -> list[Numbers]:
@@ -81,8 +82,8 @@ def serial(
 ) -> FloatArray:
     """Compute the serial Jacobian B of A v = B theta_dot, (..., 3, 3) m^2/rad, diagonal.
 
-    Rows 1 and 2 are multiplied by cos(beta), as in :func:`parallel`. So det B = cos(beta) times the
-    product of the factors of Eq. (17).
+    Rows 1 and 2 are multiplied by cos(beta), as in :func:`parallel`. With these rows, det B is
+    cos(beta) times the product of the factors of Eq. (17).
     """
 
     def results(c: _Configuration) -> list[Numbers]:
@@ -178,7 +179,10 @@ def factors(
 def factors_at(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: AnyLengths = PAPER
 ) -> Factors:
-    """Compute factors at points; they are accurate at singularities too, and NaN out of reach."""
+    """Compute the factors of det A and det B at points; NaN where a point is out of reach.
+
+    The factors are accurate at singularities too.
+    """
     return Factors(*_from_points(lambda c: c.factors, position, branch, geometry, math.nan))
 
 

@@ -33,7 +33,8 @@ class Namespace:
         arcsin: Arcsine of the clipped number.
         cos_third: Cosine of a third of the arccosine of the clipped number.
         positive: Angle in [0, 2 pi) from an angle in [-pi, pi].
-        signs: The two numbers -1 and 1, in a given shape, with the type of a given number.
+        signs: Array or tensor of the two numbers -1 and 1. The arguments are a number, whose type
+            and device a tensor gets, and the shape, such as (2, 1).
         stack: Components (...,) joined along a new last axis.
         join: Points (..., 3) broadcast with each other, and joined along their last axis.
         solve: Solutions of linear systems (..., k, k) for right sides (..., k).
@@ -138,12 +139,15 @@ def _torch() -> Namespace:
 def by_rows(
     text: Callable[[Any, Namespace], Sequence[Numbers]], points: FloatArray
 ) -> list[FloatArray]:
-    """Apply the function ``text`` to the components (n,) of points (..., k), in blocks of rows.
+    """Call the function ``text`` for points (..., k), in blocks of n points.
 
-    A result of ``text`` is a column (n,), a tuple of columns, or a tuple of such tuples.
+    The arguments of ``text`` are the k components of a block's points, each an array (n,), as one
+    tuple, and the namespace. Each result of ``text`` is a column (n,), a tuple of m columns, or a
+    tuple of l such tuples.
 
     Returns:
-        The results as arrays: (...,) for a column, (..., m) for a tuple of m columns.
+        For each result of ``text``, an array for all points: (...,) for a column, (..., m) for a
+        tuple of m columns, (..., l, m) for a tuple of l such tuples.
     """
     ns, shape = namespace_of(points), points.shape[:-1]
     flat = points.reshape(-1, points.shape[-1])

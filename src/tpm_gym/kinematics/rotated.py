@@ -92,7 +92,10 @@ class RotatedPostures:
         return self.ends - feet
 
     def _moved(self, offset: Sequence[FloatArray | float]) -> FloatArray:
-        """Return C1 plus an offset (x, y, z), m, in the frame of link 3', as (..., 3) m."""
+        """Return the points at an offset from C1, (..., 3) m.
+
+        ``offset`` is (x, y, z) in the frame of link 3', m.
+        """
         x, y, z = offset
         cos, sin = np.cos(self.tilt), np.sin(self.tilt)
         along, up = x * cos + z * sin, z * cos - x * sin
@@ -239,8 +242,8 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     # Where p = q = 0, two neighbouring zeros coincide, and rho has both signs.
     rho = np.where(abs(p) < _MERGED * g.l4, [1, -1, 1, -1], np.sign(p * q)) * NUMPY.root(rho2)
     (rho, tilt), gaps, slopes = _refined(closures, rho, tilt)
-    # The planar factor and the derivative of rod 6's closure along rho(phi) have this sign. It
-    # alternates from one zero to the next.
+    # This is 4 rho^2 times the planar factor. The derivative of rod 6's closure along rho(phi) has
+    # the same sign, which alternates from one zero to the next.
     a, b, c, d = slopes
     sign = (a * d - b * c) * rho
     real = near & (np.maximum(*map(abs, gaps)) < _CLOSED * g.l4**2)
@@ -249,13 +252,13 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
 
 
 def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArray]:
-    """Solve for theta_1 and tilt, (..., 6), given P, and P - C1 in the frame of link 3'.
+    """Solve for theta_1 and tilt, (..., 6) rad each.
 
-    Both vectors, ``p`` and ``link7``, are seen along y. The inner function ``terms`` returns two
-    values for a tilt phi: ``up`` is the l3 sin(theta_1) for which B1C1 bisects the angle between
-    links 3 and 3', and ``out`` is the l3 cos(theta_1) for which rods 4 have their length. So the
-    equation up^2 + out^2 = l3^2 gives phi. Multiplied by cos^2(phi / 2), this equation is a
-    trigonometric polynomial of degree 3.
+    ``p`` is point P, and ``link7`` is the vector from C1 to P in the frame of link 3', both in m
+    and seen along y. The inner function ``terms`` computes ``up`` and ``out`` for a tilt phi: if
+    l3 sin(theta_1) is ``up``, B1C1 bisects the angle between links 3 and 3'; if l3 cos(theta_1) is
+    also ``out``, rods 4a and 4b have their length. So the equation up^2 + out^2 = l3^2 gives phi.
+    Multiplied by cos^2(phi / 2), this equation is a trigonometric polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 
@@ -339,15 +342,17 @@ def _link7(
 def factors(postures: RotatedPostures) -> Factors:
     """Compute the factors that are zero where a rotated assembly is singular.
 
-    The names are as in :class:`.equations.Factors`, with these formulas, (...,) each:
+    The names are as in :class:`.equations.Factors`, and each factor is (...,). Besides sin(beta)
+    and cos(beta), the factors are:
 
-    * level3 = l7 cos(beta) - B3C3 . u, m, with u along link 3'.
-    * planar = B2C2 . dC2/dphi with motor 1 locked, m^2/rad, zero where the lines of rods 4a, 4b
-      and 6, seen along y, meet in one point.
-    * leg1, m^2/rad, zero where motor 1 can turn while P rests and link 3' turns about P.
-    * leg2 and leg3 = B_iC_i . dB_i/dtheta_i, m^2/rad.
-    * elevation = z_C1 - z_B1 = -rho sin(phi / 2), m, zero where the two operation modes meet; see
-      :func:`link3_rotated`.
+    * level3 (m): l7 cos(beta) - B3C3 . u, where u is the unit vector along link 3'.
+    * planar (m^2/rad): B2C2 . dC2/dphi with motor 1 locked. It is zero where the lines of rods 4a,
+      4b and 6, seen along y, meet in one point.
+    * leg1 (m^2/rad): no short formula. It is zero where motor 1 can turn while P rests and link 3'
+      turns about P.
+    * leg2 and leg3 (m^2/rad): B_iC_i . dB_i/dtheta_i.
+    * elevation (m): z_C1 - z_B1 = -rho sin(phi / 2), with rho as in :func:`link3_rotated`. It is
+      zero where the two operation modes meet.
     """
     g = postures.geometry
     rods, rates = postures.rods, _elbow_rates(postures.theta, g)

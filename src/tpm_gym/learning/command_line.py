@@ -26,7 +26,8 @@ class ExportConfig:
     """best.zip or last.zip in the folder of a run, or an exported policy (.json)."""
 
     out: Annotated[Positional[Path], tyro.conf.arg(metavar="OUT")]
-    """Common name of the new files. They replace an earlier policy or model card, no other file."""
+    """Path of the new files without their endings. Files of an earlier policy or model card are
+    replaced, other files never."""
 
     trust_pickle: bool = False
     """Load a .zip file, which can run any code."""

@@ -24,7 +24,8 @@ from tpm_gym.learning.rollout import SELECTION_SEED, TEST_SEED
 from tpm_gym.learning.run_folder import CONFIG_FILE
 
 UNSET: Final[Any] = None
-"""Value of an option that is not given; :func:`complete` or the resumed run determines it."""
+"""Placeholder for an option that is not given. The option then gets its value from the recipe, the
+policy, the resumed run, the environment id or another default."""
 
 _MOST_PROCESSES: Final = 1000
 _MOST_THREADS: Final = 1024
@@ -91,7 +92,8 @@ class EnvOptions:
         str,
         unset(Literal["ideal", "servo"], "the id's; evaluate: the policy's", "{ideal,servo}"),
     ] = UNSET
-    """Motors: ideal ones follow commands exactly up to their peak torque; servo drives lag."""
+    """Drives of the motors: ideal drives follow their references exactly, up to the peak torque;
+    servo drives lag behind."""
 
     shield: Annotated[bool | float | None, _SHIELD, _SHIELD_HINT] = UNSET
     """Replace actions by the nearest actions that keep clear of singularities."""
@@ -155,7 +157,8 @@ class TrainingConfig:
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
-    """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
+    """Attributes of Randomisation, each with a number (encoder_noise=1e-4) or with a range LOW:HIGH
+    (block_mass=0.5:2)."""
 
     eval_every: Annotated[
         int, unset(int, "a tenth of the steps; a twentieth in --engine analytic", "INT")
@@ -166,8 +169,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the final test in each engine; 0 for no test. Only a training in --engine
-    analytic ends with a test, which runs the best policy in that engine and in PyBullet."""
+    """Episodes of the final test in each of its two engines; 0 for no test. Only a training in
+    --engine analytic has this test. It runs the best policy in that engine and in PyBullet."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so
@@ -184,7 +187,7 @@ class TrainingConfig:
 
     @property
     def rollout(self) -> int:
-        """Number of steps between two updates, over all environments."""
+        """Number of steps between two updates, summed over all environments."""
         return self.envs * int(self.argument("train_freq") or self.argument("n_steps"))
 
     def argument(self, name: str) -> Any:
@@ -193,12 +196,12 @@ class TrainingConfig:
 
     @property
     def horizon(self) -> int:
-        """Number of steps of one full episode, over all environments."""
+        """Number of steps of one full episode in each environment, summed over all environments."""
         return self.envs * (check_env_id(self.env).max_episode_steps or 0)
 
     @property
     def demonstrated(self) -> int:
-        """Number of steps of the demonstrations, over all environments."""
+        """Number of steps of the demonstrations, summed over all environments."""
         episodes = int(self.recipe.demonstrations.get("episodes", 0))
         return -(-episodes // self.envs) * self.horizon
 
@@ -407,7 +410,10 @@ def _check_recipe(config: TrainingConfig) -> None:
 
 
 def _check_device(device: str) -> None:
-    """Refuse a device that PyTorch does not have, before anything is deleted for the run."""
+    """Refuse a device that PyTorch does not have.
+
+    PyTorch itself would refuse the device only after an earlier run in the folder is deleted.
+    """
     import torch
 
     try:

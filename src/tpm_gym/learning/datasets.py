@@ -171,7 +171,7 @@ def _require_packages(kinds: Sequence[str]) -> None:
 
 
 def _complete(config: CollectConfig) -> list[str]:
-    """Check the options; return the ids."""
+    """Check the options; return the ids of the environments."""
     check_least(config, 1, "episodes", "steps")
     check_least(config, 0, "seed", "noise")
     for name in ("env", "kind"):

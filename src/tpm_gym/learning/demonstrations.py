@@ -28,7 +28,11 @@ _OTHER: Final = ("num_envs", "vectorization_mode", "autoreset_mode", "stagger", 
 
 
 class _Step(NamedTuple):
-    """Control step of n environments: ``actions`` are the expert's ``wanted`` plus noise."""
+    """Control step of n environments.
+
+    ``wanted`` are the expert's actions. ``actions``, which the environments execute, are the
+    expert's actions plus noise.
+    """
 
     seen: Observation
     wanted: Action
@@ -137,10 +141,11 @@ class Demonstrations(BaseCallback):
 
 
 def _returns(steps: Sequence[_Step], gamma: float) -> list[NDArray[Any]]:
-    """Return the discounted sum of rewards (n,) from each step on.
+    """Return, for each step, the discounted sum of the rewards from this step on.
 
-    The last reward of an episode is assumed to continue for ever, since only a time limit ends it.
-    Without discount, that sum would be infinite, and the last reward counts once.
+    The sums of a step are an array (n,), one for each of n environments. The last reward of an
+    episode is assumed to continue for ever, since only a time limit ends the episode. If gamma is
+    1, this sum would be infinite, so the last reward is counted only once.
     """
     found: list[NDArray[Any]] = []
     total: Any = 0.0

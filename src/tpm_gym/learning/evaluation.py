@@ -77,7 +77,8 @@ class EvaluationConfig:
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
-    """Attributes of Randomisation, as in encoder_noise=1e-4 block_mass=0.5:2 (LOW:HIGH)."""
+    """Attributes of Randomisation, each with a number (encoder_noise=1e-4) or with a range LOW:HIGH
+    (block_mass=0.5:2)."""
 
     json: Annotated[Path | None, unset(Path, "not written", "PATH")] = None
     """File for metrics, episodes and versions."""

@@ -30,7 +30,9 @@ from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-4
-"""Largest error of an exported action, divided by the larger of 1 and half the action's range.
+"""Largest error of an exported action, relative to half the action's range.
+
+If half the range is less than 1, the absolute error counts.
 
 Single precision rounds the actions of networks with large weights by 1e-5. Wrong weights or a wrong
 activation cause far larger errors.
@@ -69,7 +71,7 @@ def save(
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
-        path: Common name of the files. An earlier policy is replaced.
+        path: Path of the files without their endings. An earlier policy is replaced.
         env_options: Machine, engine, drive and shield of the training. Options that are left out
             have the defaults of ``env_id``.
         versions: Versions at training; by default the installed ones.

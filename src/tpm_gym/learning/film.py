@@ -64,7 +64,8 @@ def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
 def _moments(frames: list[Frame]) -> list[int]:
     """Return the indices of six frames that differ most.
 
-    Choose the first and the last frame, then repeatedly the frame least like all chosen frames.
+    Choose the first and the last frame. Then repeatedly choose the frame that differs most from the
+    chosen frame to which it is most similar.
     """
     pictures = np.stack(frames)[:, ::2, ::2].astype(np.int16)
 

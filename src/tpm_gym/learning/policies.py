@@ -53,7 +53,7 @@ class RandomPolicy:
         """Seed a generator for each episode with the episode's seed and a constant.
 
         The environment draws its goal from a generator that is seeded with the episode's seed only.
-        Actions from a generator with this seed would depend on the goal.
+        Without the constant, actions and goal would come from the same random numbers.
         """
         self.rngs = [np.random.default_rng([seed, _ACTIONS]) for seed in seeds]
 

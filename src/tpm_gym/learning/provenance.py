@@ -1,4 +1,4 @@
-"""Provenance of a result (versions, commit, machine, command); writing files in one step."""
+"""Provenance of a result (versions, commit, computer, command); writing files in one step."""
 
 import json
 import os
@@ -25,7 +25,7 @@ _PACKAGES: Final = (
 
 
 def origin() -> dict[str, Any]:
-    """Return versions, commit, machine and command as plain data."""
+    """Return versions, commit, computer and command as plain data."""
     return {
         "versions": versions(),
         "git_commit": git_commit(),
@@ -89,7 +89,11 @@ def command_line(arguments: Sequence[str] | None = None) -> str:
 
 
 def _portable(word: str) -> str:
-    """Make an absolute path relative to the working directory, or keep only its last part."""
+    """Return a word of a command, in which an absolute path is shortened.
+
+    An absolute path inside the working directory becomes relative to this directory. Of another
+    absolute path, only the last part is kept.
+    """
     option, equals, value = word.rpartition("=")
     path = Path(value)
     if not path.is_absolute():

@@ -58,12 +58,12 @@ class Recipe:
         return {**found, **self.arguments}
 
     def keywords(self, update: float = 0.0) -> dict[str, Any]:
-        """Return keyword arguments of the constructor, with classes in place of their names.
+        """Return keyword arguments for the algorithm's constructor, with classes, not their names.
 
         Args:
-            update: Steps between two updates, as a fraction of all steps. A falling learning rate
-                ends at this fraction of its first value, in the last update. With ``update=0``, as
-                in Stable-Baselines3, the rate ends at zero, and the last update changes nothing.
+            update: Steps between two updates, as a fraction of all steps. In the last update, a
+                falling learning rate is ``update`` times its first value. With ``update=0``, as in
+                Stable-Baselines3, this rate is zero, and the last update changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):
@@ -88,9 +88,9 @@ def _falling(start: float, update: float, remaining: float) -> float:
 def recipe(env_id: str, algorithm: str = "sac", engine: str | None = None) -> dict[str, Any]:
     """Return the shipped recipe of an environment as keyword arguments for Stable-Baselines3.
 
-    For example ``SAC(env=env, **recipe("TPMReach-v0"))``. The numbers of steps and environments and
-    the demonstrations are left out: they are no arguments of the constructor. An id without a
-    recipe gets the recipe of pick-and-place.
+    For example ``SAC(env=env, **recipe("TPMReach-v0"))``. ``n_timesteps``, ``n_envs`` and
+    ``demonstrations`` are left out, since the algorithm's constructor has no such arguments. An id
+    without a recipe gets the recipe of pick-and-place.
 
     Args:
         engine: Engine to train in; ``"analytic"`` has recipes of its own.

@@ -52,8 +52,9 @@ _Evaluation = TypedDict(
 )
 """Entries of an evaluation that a resumed training needs."""
 RESTORED: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, *_BEST)
-"""Files that a checkpoint holds. Resuming restores them as they were at the checkpoint. Entries
-that were written after the checkpoint are removed, and the resumed training writes them again."""
+"""Files that a checkpoint holds. Resuming replaces each file by its copy in the checkpoint, except
+the configuration, which is written anew. So lines that were added to a file after the checkpoint
+are removed, and the resumed training writes them again."""
 
 
 def prepare(run: Path, overwrite: bool) -> None:
@@ -94,8 +95,8 @@ def description(run: Path) -> dict[str, Any] | None:
 def resume_command(run: Path) -> str:
     """Return the command line that resumes a run.
 
-    An id with a module, ``module:id``, is part of the command: a module is imported if the user
-    names it, but not if only a file does.
+    If the environment id has a module, as in ``module:id``, the command contains the id: a module
+    is imported only if the user names it in the command. A name in a file of the run is not enough.
     """
     env = str((description(run) or {}).get("env", ""))
     return shlex.join(["tpm-gym", "resume", str(run), *(["--env", env] if ":" in env else [])])

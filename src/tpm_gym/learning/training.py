@@ -192,7 +192,7 @@ def _say(console: Console, text: str) -> None:
 
 @dataclass(frozen=True)
 class _Session:
-    """Part of a run in this process, from the beginning or from the checkpoint ``content``."""
+    """Part of a run that this process executes, from the start or the checkpoint ``content``."""
 
     config: TrainingConfig
     console: Console
@@ -362,7 +362,8 @@ def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
 def _require_room(config: TrainingConfig, numbers: int) -> None:
     """Refuse a buffer that does not fit in memory.
 
-    The size of a step is assumed to be two observations of ``numbers`` values each.
+    Each stored step is assumed to take two observations. ``numbers`` is the number of values in an
+    observation.
     """
     name = "buffer_size" if config.argument("buffer_size") else "n_steps"
     size = config.argument("buffer_size") or config.rollout

@@ -1,4 +1,4 @@
-"""State of a training between two rollouts, saved and restored bit by bit.
+"""State of a training between two rollouts, saved and restored exactly, to the last bit.
 
 On one thread, and on the same kind of computer, a restored training continues as if it had not been
 interrupted. A resumed hindsight training looks untrained if one of three things is missing:
@@ -208,7 +208,7 @@ def _restore_tensors(model: BaseAlgorithm, data: bytes) -> None:
 
 
 def _rng_state(model: BaseAlgorithm) -> dict[str, Any]:
-    """Return the states of the generators outside PyTorch and the environments."""
+    """Return the states of the random generators of Python, NumPy and the action space."""
     return {
         "python": random.getstate(),
         "numpy": np.random.get_state(legacy=False),  # noqa: NPY002  # SB3 draws from it
@@ -285,7 +285,7 @@ class _Log(Logger):
     earlier = 0
 
     def record(self, key: str, value: Any, exclude: str | tuple[str, ...] | None = None) -> None:
-        """Store a value for the next line."""
+        """Store a value for the next line of the log."""
         counted = key == "time/iterations"
         super().record(key, value + self.earlier if counted else value, exclude)
 

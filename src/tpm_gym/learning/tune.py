@@ -173,10 +173,10 @@ def _started(ray: Any, jobs: int | None) -> Iterator[None]:
 
 
 def _suggest(algorithm: str, trial: Any) -> dict[str, Any]:
-    """Let Optuna choose the values of a trial; return an entry with the number of the trial.
+    """Let Optuna choose the values of a trial; return a dictionary with the trial's number.
 
-    Ray Tune records the chosen values and adds them to the returned entry. Both together are the
-    ``changes`` of the trial.
+    Ray Tune adds the chosen values to this dictionary and passes it to :func:`_train` as
+    ``changes``.
     """
     known = ALGORITHMS[algorithm].entries().__annotations__
     for name, values in _SPACE.items():

@@ -129,9 +129,9 @@ class Joint:
             joints.
         upper: Upper limit, rad or m.
         effort: Limit of torque or force, N m or N; zero for passive joints.
-        speed: Speed at which the largest effort is zero, rad/s or m/s; zero for passive joints.
-        corner: Highest speed with full effort, rad/s or m/s; from there to ``speed`` the effort
-            falls linearly.
+        speed: Speed at which no effort is left, rad/s or m/s; zero for passive joints.
+        corner: Highest speed with full effort, rad/s or m/s. From ``corner`` to ``speed``, the
+            limit of the effort falls linearly to zero.
         rpy: Roll, pitch and yaw of the joint's frame in the parent's frame, rad, as in URDF.
     """
 

@@ -152,7 +152,13 @@ def _require_parts(mechanism: Mechanism) -> None:
 
 
 def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
-    """Refuse missing or repeated names, links without mass, and links before their parents."""
+    """Refuse wrong links, and names that are missing or repeated.
+
+    All links have a mass. All links but the first have a joint to a link that is listed before
+    them. Links have different names, and so have joints and closures. Closures, ``platform``
+    and ``tool`` refer to existing links, and ``actuated`` to existing joints. ``joints`` has a
+    position for each moving joint.
+    """
     links, names = [link.name for link in mechanism.links], moving_joints(mechanism)
     held = [link.joint for link in mechanism.links[1:]]
     if mechanism.links[0].joint or None in held:

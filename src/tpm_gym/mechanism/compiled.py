@@ -201,5 +201,5 @@ def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
-    """Reshape arrays (m, ...) to the leading shape of an array (..., 3)."""
+    """Reshape arrays: all axes of ``like`` but the last take the place of an array's first axis."""
     return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)

@@ -178,7 +178,10 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Call the function ``text`` with the pose at theta and with the other states.
+        """Call the function ``text`` for all rows of the states.
+
+        The arguments of ``text`` are the configuration at theta, and then all states but theta,
+        which is the first state.
 
         Returns:
             Results of ``text`` for all rows.

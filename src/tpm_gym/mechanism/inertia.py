@@ -52,8 +52,8 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
     The force follows from Lagrange's equation for the kinetic energy of :class:`Swing`.
 
     Args:
-        rod: BC as (out, level, z), m. The swing is the angle of (level, z), with its axis along
-            ``out``.
+        rod: Components (out, level, z) of BC, m. ``out`` is along the axis of the swing, level and
+            z are perpendicular to the axis. The angle of the swing is the direction of (level, z).
         rates: Derivatives of ``rod`` by time, m/s.
         changes: Second derivatives of level and z by time, m/s^2.
         m: Inertia of the swing.
@@ -85,7 +85,10 @@ class Bodies:
         self.known: set[str] = set()
 
     def require_all_known(self) -> None:
-        """Refuse a mechanism with a body that was not used."""
+        """Refuse a mechanism with a moving link that no constant of the dynamics includes.
+
+        A link counts as included if a method such as :meth:`mass` was called for it.
+        """
         left = [name for name, link in self._links.items() if link.mass and name not in self.known]
         if left:
             raise ConfigurationError(

@@ -73,12 +73,12 @@ class Equations(NamedTuple):
 
 
 def get(columns: FloatArray, first: int, j: int) -> Triple:
-    """Return the entries of row j in three columns, from ``first`` on."""
+    """Return the entries of row j in three columns, beginning at column ``first``."""
     return columns[first, j], columns[first + 1, j], columns[first + 2, j]
 
 
 def _put(columns: FloatArray, first: int, j: int, values: Triple, real: bool) -> None:
-    """Write row j of three columns, from ``first`` on; NaN if there is no solution."""
+    """Write row j of three columns, beginning at column ``first``; NaN if there is no solution."""
     columns[first, j] = values[0] if real else math.nan
     columns[first + 1, j] = values[1] if real else math.nan
     columns[first + 2, j] = values[2] if real else math.nan
@@ -95,10 +95,11 @@ def _place(
 
 
 def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray) -> None:
-    """Fill the columns ``own`` with the machine parameters of ``count`` rows from ``start`` on.
+    """Fill the columns ``own`` with the machine parameters of a block of rows.
 
-    ``each`` is the number of rows of one machine. If all rows belong to one machine, only
-    the first block fills the columns, and all blocks use them.
+    The block has ``count`` rows, beginning at row ``start``. ``each`` is the number of rows of one
+    machine. If all rows belong to one machine, the columns are filled for the first block only, and
+    later blocks use them again.
     """
     if start == 0 or len(built) > 1:
         for j in range(count):
@@ -108,7 +109,10 @@ def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray)
 
 
 def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: int) -> None:
-    """Copy ``count`` of ``rows`` (n, 3), from ``start`` on, to three columns, from ``first`` on."""
+    """Copy ``count`` rows, beginning at row ``start``, to three columns, beginning at ``first``.
+
+    ``rows`` is (n, 3).
+    """
     for j in range(count):
         columns[first, j] = rows[start + j, 0]
         columns[first + 1, j] = rows[start + j, 1]

@@ -18,8 +18,8 @@ SOLID = "solid"
 """Class of geoms that collide; geoms of the other class are only drawn."""
 
 STIFF = "0.9999 0.9999 0.001 0.5 2"
-"""Impedance (solimp) of rigid constraints: the largest that MuJoCo accepts. It is equal for gaps of
-any size."""
+"""Impedance (solimp) of rigid constraints: the largest that MuJoCo accepts. It does not depend on
+the size of the gap."""
 
 # The file's time step (s), and its servos: N m/rad and N m s/rad.
 _TIME_STEP, _STIFFNESS, _DAMPING = 0.0005, 20000.0, 130.0

@@ -161,9 +161,9 @@ def potential(pose: Pose, gravity: Triple, m: Inertia) -> Numbers:
 
 
 def _drift(leg: _Leg, v: Triple, rate: Numbers) -> Numbers:
-    """Compute B_iC_i . a for the acceleration a of P at theta_ddot = 0, m^2/s^2.
+    """Compute B_iC_i . a, m^2/s^2, where a is the acceleration of P if theta_ddot is 0.
 
-    It follows from the second derivative of the closure.
+    This product follows from the second derivative by time of the closure |B_iC_i|^2 = l4^2.
     """
     x, _, z = leg.rod
     u, w = v[0] + leg.sin * rate, v[2] - leg.cos * rate
@@ -210,7 +210,7 @@ def _turn(leg: _Leg, v: Triple, rate: float) -> Numbers:
 
 
 def _swinging(leg: _Leg) -> Numbers:
-    """Compute ``fixed + spin * out**2`` of a leg's :class:`.inertia.Swing`, kg m^2."""
+    """Compute the moment of inertia of a leg's swing, kg m^2, from :class:`.inertia.Swing`."""
     out = leg.rod[1]
     return leg.swing.fixed + leg.swing.spin * out * out
 

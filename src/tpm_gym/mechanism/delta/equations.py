@@ -128,7 +128,10 @@ def pose_at(theta: Triple, side: Numbers, g: AnyDelta, ns: Namespace) -> tuple[P
 
 
 def pose_of(cos: Triple, sin: Triple, position: Triple, g: AnyDelta) -> Pose:
-    """Compute the configuration from arms (m) and P (m); the rods have to fit between them."""
+    """Compute the configuration from P and the arms' components ``cos`` and ``sin``, all in m.
+
+    The distances from B_i to C_i have to be l4, which is not checked.
+    """
     r1 = rod(ONE, position, cos[0], sin[0], g)
     r2 = rod(TWO, position, cos[1], sin[1], g)
     r3 = rod(THREE, position, cos[2], sin[2], g)

@@ -21,7 +21,7 @@ class DeltaLengths(NamedTuple):
 
 @dataclass(frozen=True)
 class DeltaGeometry:
-    """Lengths of a Delta, m. Each has the number of the matching length of the paper's mechanism.
+    """Lengths of a Delta, m, with the names of the corresponding lengths of the paper's mechanism.
 
     Attributes:
         l1: Radius of the base: distance from O to each actuated pivot A_i.
@@ -97,8 +97,9 @@ def require_side(side: object) -> None:
 IRB_360 = DeltaGeometry(l1=0.164, l2=0.044, l3=0.524, l4=1.244, l5=0.050)
 """ABB's FlexPicker IRB 360-1/1600, with the lengths that R. L. Williams II gives in "The Delta
 Parallel Robot: Kinematics Solutions" (Ohio University, 2016). The base is a triangle with sides of
-0.567 m and the inner radius l1. The platform is a triangle with sides of 0.076 m and the outer
-radius l2. Arms are 0.524 m long, and rods 1.244 m. Programs that others wrote after his paper have
-the same numbers, for example giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. We chose
-l5 ourselves: with the half distance of 65.5 mm in his paper, the ball joints of our rods would
-touch on the platform."""
+0.567 m, whose inscribed circle has the radius l1. The platform is a triangle with sides of 0.076 m,
+whose circumscribed circle has the radius l2. Arms are 0.524 m long, and rods 1.244 m. Programs that
+others wrote after his paper have the same numbers, for example
+giridharanponnuvel/Delta-Robot-Inverse-Kinematics on GitHub. We chose l5 ourselves. In his paper,
+half the distance between the two rods of a leg is 65.5 mm; with this value, the ball joints of our
+rods would touch on the platform."""

@@ -184,7 +184,10 @@ def no_assembly(
 
 
 def _regular(pose: Pose, regular: Numbers, ns: Namespace) -> Pose:
-    """Set det A to 1 where J does not exist; else the derivatives by the lengths would be NaN."""
+    """Set det A to 1 where J does not exist.
+
+    Otherwise, the derivatives of all rows with respect to the lengths would be NaN.
+    """
     return pose._replace(parallel=ns.where(regular, pose.parallel, 1.0))
 
 
