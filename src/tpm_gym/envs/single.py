@@ -175,9 +175,10 @@ class TPMEnv(gym.Env[Observation, Action]):
             a singularity. This is possible only if the machine's region for goals has such places.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
         drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
-            100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references. Its
-            gains are 7500 N m/rad, 60 N m s/rad; the torques of the nominal motion are fed forward. Its largest torque is 100 N m up to 18.75 rad/s, and falls to
-            zero at 25 rad/s. For a servo drive with other parameters, give a
+            100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references.
+            Its gains are 7500 N m/rad, 60 N m s/rad; the torques of the nominal motion are fed
+            forward. Its largest torque is 100 N m up to 18.75 rad/s, and falls to zero at
+            25 rad/s. For a servo drive with other parameters, give a
             :class:`~tpm_gym.simulation.Servo` or a mapping of its attributes.
         randomisation: Differences from the nominal machine, drawn for each episode: a
             :class:`~tpm_gym.simulation.Randomisation` or a mapping of its attributes. If disturbed

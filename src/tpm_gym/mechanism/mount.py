@@ -54,7 +54,7 @@ class Mount:
 
     @cached_property
     def frame(self) -> tuple[FloatArray, FloatArray]:
-        """Factors and origin, (3,) each.
+        """Factors (1 or -1) of the coordinates and origin (m) for the conversion, (3,) each.
 
         World = factors * point + origin, and point = factors * (world - origin).
         """

@@ -83,7 +83,7 @@ def motor(
 
 
 def saddles(axis: Literal["x", "y"], centre: Vector) -> list[Solid]:
-    """Build the boxes that hold the housings of a motor (along ``axis``) to the base."""
+    """Build the boxes that fix a motor's two housings to the base; the motor is along ``axis``."""
     size = (0.06, 0.12, 0.09) if axis == "x" else (0.12, 0.06, 0.09)
     middles = (displaced("z", -0.06, half) for half in TORQUE_MOTOR.halves(axis, centre))
     return [Solid("box", size, middle, ALUMINIUM, colour="white") for middle in middles]

@@ -44,7 +44,7 @@ COLOURS = {
 }
 
 _END: Final = 0.002
-"""Height of each end of a cylinder, m; the ends are separate collision shapes.
+"""Length of each of the two end pieces of a cylinder, m; they are separate collision shapes.
 
 PyBullet finds one new contact of two shapes in a time step. If an upright cylinder hits a wall, the
 contact can be anywhere on its height. So a cup whose lip hits a block could get its contact far

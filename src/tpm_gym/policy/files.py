@@ -148,7 +148,7 @@ class Description(_Entries):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shapes of the weights by name; a layer maps x to weight x + bias."""
+        """Shapes of the weights by name; a layer maps x to ``weight @ x + bias``."""
         lengths = {key: len(box.low) for key, box in self.observations.items()}
         if self.network.features.kind == "goal_gap":
             del lengths["achieved_goal"]  # only in the gap, which has the size of the desired goal

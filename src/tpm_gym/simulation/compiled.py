@@ -59,10 +59,11 @@ def shifted(
 def bounded(
     observed: FloatArray, bound: float, achieved: FloatArray, goal_bound: float, goals: FloatArray
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], bool]:
-    """Clip observations and achieved goals to +-bounds; convert both and the goals to float32.
+    """Clip ``observed`` to +-``bound`` and ``achieved`` to +-``goal_bound``.
 
     Returns:
-        The three arrays in float32, and whether observations and achieved goals have no NaN.
+        Three arrays in float32: clipped ``observed``, clipped ``achieved``, and ``goals``. A bool:
+        whether ``observed`` and ``achieved`` have no NaN.
     """
     first = np.empty(observed.shape, np.float32)
     second, third = np.empty(achieved.shape, np.float32), np.empty(goals.shape, np.float32)
@@ -102,8 +103,10 @@ def in_world(
         theta_dot: (n, 3) rad/s.
         commands: (n, 3, 3) m, machine's frame; commands[:, 1] is converted.
         quaternion: (n, k, 4), orientations of the objects, world.
-        left: (n,) mode that each robot has left now: 0 none, 1 assembly, 2 working.
-        mode_left: (n,) mode that each robot left first; overwritten.
+        left: (n,) mode that each robot has left, as the engine reports it: 0 none, 1 assembly, 2
+            working.
+        mode_left: (n,) first mode that each robot has left in its episode, same numbers. Entries
+            that are 0 are replaced with those of ``left``.
         gap: (n,) m, largest gap of each robot. If it is above ``limit`` or NaN, a loop is open.
         limit: Largest allowed gap, m.
         turn: (3,) signs (1 or -1). The components of a vector in the machine's frame times these
@@ -213,7 +216,15 @@ def distances(points: FloatArray, others: FloatArray) -> FloatArray:
 
 @kept
 def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return (n,) whether any place (n, k, 3) is outside low to high (k, 3); NaN is outside."""
+    """Return for each row whether any of its k places is outside the box of this place, (n,).
+
+    A place with NaN is outside.
+
+    Args:
+        places: (n, k, 3).
+        low: (k, 3), lowest coordinates in the boxes.
+        high: (k, 3), highest coordinates in the boxes.
+    """
     found = np.zeros(len(places), np.bool_)
     for row in range(len(places)):
         for item in range(places.shape[1]):
@@ -251,8 +262,8 @@ def truth(
     """Compute the largest loop gap (m), point P (m, world) and the platform's tilt (rad).
 
     Args:
-        frames: (7 l,) seven numbers for each of l links, world frame: origin (m), orientation
-            (x, y, z, w).
+        frames: Seven numbers for each link, one link after another, world frame: origin (m), and
+            orientation (x, y, z, w).
         sides: (c, 2) indices of the two links of each closure.
         pivots: (c, 2, 3) m, points of each closure, in the frames of its links.
         platform: Index of the platform's link.
@@ -282,11 +293,11 @@ def friction_force(
     moments: Vector,
     step: float,
 ) -> tuple[Vector, Vector]:
-    """Compute Coulomb's friction on a block for the next time step, from the slip in the last one.
+    """Compute Coulomb's friction on a block in the next time step, from its present slip.
 
-    The force has two parts. The first part would end the slip in one time step, and is zero without
-    slip. The second part holds a block that sticks. Each time step adds half of the first part to
-    the second part.
+    The friction is the sum of two parts. The ending part would end the slip in one time step, and
+    is zero without slip. The steady part holds a block that sticks. In each time step, half of the
+    ending part is added to the steady part.
 
     Args:
         point: Point of contact, m.
@@ -294,14 +305,14 @@ def friction_force(
         place: Centre of the block, m.
         motion: Velocity (m/s) and angular velocity (rad/s) of the block, and velocity (m/s) of the
             other body.
-        before: Second part of the force in the last time step, N.
+        before: Steady part of the friction in the last time step, N.
         most: Largest friction, N; a negative value is taken as 0.
         mass: Mass of the block, kg.
         moments: Principal moments of inertia of the block, which is assumed upright, kg m^2.
         step: Time step, s.
 
     Returns:
-        The friction on the block, and its second part, N.
+        The friction on the block, and the steady part of this friction, N.
     """
     arm = plus(point, place, -1.0)
     slip = plus(plus(motion[0], cross(motion[1], arm)), motion[2], -1.0)
@@ -317,7 +328,7 @@ def friction_force(
 
 @compiled
 def _at_most(vector: Vector, most: float) -> Vector:
-    """Shorten a vector to the length ``most`` if it is longer; a negative ``most`` is 0."""
+    """Shorten a vector to the length ``most`` if it is longer; negative ``most`` counts as 0."""
     share = min(1.0, max(most, 0.0) / max(length(vector), 1e-12))
     return plus((0.0, 0.0, 0.0), vector, share)
 
@@ -348,12 +359,16 @@ def spline_points(commands: FloatArray, weights: FloatArray) -> FloatArray:
 
 @kept
 def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray:
-    """Return d candidates for each of k points of r environments, (r, k, d, 3), in boxes.
+    """Return d candidates for each of k points in each of r environments, (r, k, d, 3).
+
+    Each point has one or more boxes. All candidates for a point lie in one of its boxes.
 
     Args:
-        shares: (r, k, d, 4) random numbers in [0, 1). The first three are the place in a box. The
-            fourth number of the first candidate chooses the box of all d candidates.
-        boxes: (b, 2, 3) low and high corners: all boxes of the first point, then of the second.
+        shares: (r, k, d, 4) random numbers in [0, 1), four for each candidate. The first three
+            numbers determine the candidate's place in the box. The fourth number of a point's first
+            candidate chooses the box of all its candidates; the other fourth numbers are not used.
+        boxes: (sum of ``counts``, 2, 3) low and high corners of the boxes: the boxes of the first
+            point, then the boxes of the second point, and so on.
         counts: (k,) number of boxes of each point.
     """
     points = np.empty((*shares.shape[:3], 3))
@@ -379,16 +394,16 @@ def accepted(
     rows: IntArray,
     points: FloatArray,
 ) -> BoolArray:
-    """Choose the first draws that are safe and apart from the points before them.
+    """Choose, for each point, the first draw that is safe and far enough from the earlier points.
 
     Args:
-        drawn: (r, k, d, 3) m, draws for the last k points of each row.
-        conditioning: (r, k, d), at the draws.
-        least: Smallest conditioning.
-        most: Bound of the conditioning; accepted draws are below it.
-        apart: Smallest distance from the points before, m.
-        rows: (r,) rows of ``points``.
-        points: (n, j, 3) m; output.
+        drawn: (r, k, d, 3) m, d draws for each of the last k points of a row.
+        conditioning: (r, k, d) conditioning at the draws.
+        least: Smallest conditioning of a chosen draw.
+        most: Upper limit; the conditioning of a chosen draw is smaller.
+        apart: Smallest distance of a chosen draw from the earlier points of its row, m.
+        rows: (r,) indices of the rows of ``points`` for which points are chosen.
+        points: (n, j, 3) m, j points of each row; the chosen draws are written to the last k.
 
     Returns:
         Whether all k points of each row were found, (r,).
@@ -445,13 +460,15 @@ def arrived(
 
 @kept
 def differences(theta: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return joint positions, velocities and accelerations (n, k, 3) in k time steps.
+    """Return joint positions, velocities and accelerations for each of k time steps, (n, k, 3).
 
-    The positions are at the beginning of each time step. The velocities are the mean velocities of
-    the time step before.
+    For each time step, the position is the one at its beginning, and the velocity is the mean
+    velocity in the preceding time step. The acceleration is the change from this mean velocity to
+    the mean velocity in the time step itself, divided by ``step``.
 
     Args:
-        theta: (n, k + 2, 3) rad, at the ends of time steps.
+        theta: (n, k + 2, 3) rad, joint positions at the ends of two preceding time steps and of the
+            k time steps.
         step: Time step, s.
     """
     shape = len(theta), theta.shape[1] - 2, 3
@@ -468,7 +485,12 @@ def differences(theta: FloatArray, step: float) -> tuple[FloatArray, FloatArray,
 
 @kept
 def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
-    """Return (r,) whether any of the torques (r, m, 3) exceeds its motor's limit (r, 3)."""
+    """Return for each robot whether any of its torques exceeds the motor's largest torque, (r,).
+
+    Args:
+        torques: (r, m, 3) N m, torques in m time steps.
+        effort: (r, 3) N m, largest torques of the motors.
+    """
     found = np.zeros(len(torques), np.bool_)
     for row in range(len(torques)):
         for k in range(torques.shape[1]):
@@ -481,16 +503,16 @@ def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
 def ends(theta: FloatArray, step: float) -> FloatArray:
     """Compute the motion in the first and in the last time step of a control period.
 
-    The acceleration jumps between control periods, so the differences use only joint positions of
-    this control period.
+    Velocities and accelerations are computed from differences of the joint positions in this
+    control period only, because the acceleration jumps between control periods.
 
     Args:
         theta: (n, K + 1, 3) rad, from the beginning to the end of the period.
         step: Time step, s.
 
     Returns:
-        Joint positions at the beginning of the time step, joint velocities and accelerations
-        (3, 2, n, 3).
+        (3, 2, n, 3): joint positions at the beginning of the time step, joint velocities, and joint
+        accelerations; each for the first and for the last time step.
     """
     last = theta.shape[1] - 1
     found = np.zeros((3, 2, len(theta), 3))

@@ -115,7 +115,8 @@ class References(NamedTuple):
     """References of servo drives in the K time steps of a control period, for n robots.
 
     Attributes:
-        theta: (K, n, 3) rad (m for a slide), true joint positions at the end of each time step.
+        theta: (K, n, 3) rad (m for a slide), joint positions that the drives shall reach at the end
+            of each time step; true joint positions, without encoder bias.
         theta_dot: (K, n, 3) rad/s, mean joint velocities in each time step.
         torque: (K, n, 3) N m, feed-forward torques in each time step.
     """

@@ -175,12 +175,18 @@ class Path:
         return Path(self.machine, self.commands[rows], self.weights, bias)
 
     def points(self, last: int = 0) -> FloatArray:
-        """Return point P (n, k, 3) m at the ends of the last k time steps (0: all time steps)."""
+        """Return point P at the ends of the last time steps, (n, number of time steps, 3) m.
+
+        ``last`` is the number of time steps; 0 for all.
+        """
         points: FloatArray = loops().spline_points(self.commands, self.weights[-last:])
         return points
 
     def joints(self, last: int = 0) -> FloatArray:
-        """Return true joint positions (n, k, 3) rad at the ends of the last k time steps."""
+        """Return true joint positions (rad) at the ends of the last time steps.
+
+        The shape and ``last`` are explained in :meth:`points`.
+        """
         theta = self._readings(self.weights[-last:])
         return theta if self._bias is None else self.true(theta)
 
@@ -240,7 +246,11 @@ class Driven(Protocol):
 def steering(
     drives: ServoDrives | None, path: Path, robot: Driven
 ) -> tuple[Sequence[Any], Callable[[Any], None]]:
-    """Return a target for each time step, and the function that drives the robot to a target."""
+    """Return an input for each time step, and the function that passes an input to the motors.
+
+    For ideal drives, the inputs are the joint positions (rad) that the motors reach in the time
+    steps. For servo drives, the inputs are the indices of the time steps.
+    """
     if drives is None:
         return path.joints()[0].tolist(), robot.drive
     references = drives.references(path)
@@ -295,9 +305,10 @@ class Engine(Protocol):
         """Return the readings of all robots; the caller may change the arrays."""
 
     def save(self) -> Any:
-        """Return all state that the next steps depend on, as plain data or arrays.
+        """Return the state that the next time steps depend on, as plain data or arrays.
 
-        Omit state that cannot be read, such as impulses of old contacts; ``restore`` clears it.
+        The result does not include state that cannot be read, such as contact impulses of the last
+        time step. ``restore`` resets this state.
         """
 
     def restore(self, saved: Any) -> None:
@@ -338,8 +349,8 @@ def register_engine(name: str, engine: str | Factory, *, robots: int | None = 1)
         engine: Callable that creates the engine, or ``"module:attribute"``, which is imported at
             the first use. The callable may have the keywords ``gui`` (open a window),
             ``renderer``, ``physics`` (numerical settings) and ``drive`` (a
-            :class:`~tpm_gym.simulation.Servo`). The callable must not have the keyword of an
-            option that the engine does not support.
+            :class:`~tpm_gym.simulation.Servo`). Leave out the keywords of options that
+            the engine does not support.
         robots: Largest number of robots in one engine; None for no limit.
 
     Raises:

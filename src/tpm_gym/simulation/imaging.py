@@ -272,7 +272,11 @@ def _area(view: View, point: FloatArray, radius: float) -> tuple[slice, slice]:
 
 
 def _rays(view: View, rows: slice, columns: slice) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return coordinates of an area's pixels at a depth of 1: u (1, c) right and v (r, 1) up."""
+    """Return the coordinates (m) of an area's pixels in the picture's plane at a depth of 1 m.
+
+    Returns:
+        Coordinates to the right, (1, number of columns), and upwards, (number of rows, 1).
+    """
     u = (np.arange(view.width)[columns] + 0.5 - view.width / 2) / view.focal_length
     v = (view.height / 2 - np.arange(view.height)[rows] - 0.5) / view.focal_length
     return u[None, :], v[:, None]

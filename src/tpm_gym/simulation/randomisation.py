@@ -45,7 +45,7 @@ _OF_MOTORS = ("motor_strength", "servo_stiffness", "joint_friction", "encoder_bi
 
 @dataclass(frozen=True)
 class Plant:
-    """True robot of one episode, as factors of the nominal machine and deviations from it.
+    """Differences between the true robot of one episode and the nominal machine.
 
     Attributes:
         link_masses: Factor of mass and inertia for each moving link, in the order of the

@@ -1,4 +1,8 @@
-"""Simulation of n robots with any engine: encoder errors, modes and the State."""
+"""Simulation of n robots with any engine.
+
+The engine simulates the robots. This module adds encoder errors, records the modes that were left,
+and computes the State.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +37,11 @@ CLOSURE_LIMIT = 0.005
 _STEPS = 10  # time steps in a control period other than 40 ms, if the settings have none
 
 _BLUR = 0.05
-"""Distance of P from the plane of symmetry normal to ``mirror_axis``, divided by the machine's
-``step_limit`` (m) along this axis.
+"""Distance of P from the plane of symmetry at which the observed velocity is halved.
 
-At this distance, the observed velocity normal to the plane is half of the velocity J theta_dot.
+The plane is normal to the machine's ``mirror_axis``, and the distance is a fraction of the
+machine's ``step_limit`` along this axis. At this distance, the observed velocity normal to the
+plane is half of the velocity J theta_dot; in the plane, it is zero.
 """
 
 _COLUMNS = (

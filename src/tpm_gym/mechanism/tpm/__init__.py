@@ -1,4 +1,4 @@
-"""The translational parallel mechanism of the paper, with its lengths or others."""
+"""The translational parallel mechanism of the paper, with the paper's or other lengths."""
 
 from tpm_gym.mechanism.tpm.machine import PAPER_TPM, TPM, WIDE_TPM
 

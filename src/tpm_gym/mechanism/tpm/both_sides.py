@@ -20,9 +20,10 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm.machine import TPM
 
 _AT_PLANE: Final = 0.05
-"""Distance from the plane, as a share of l7, below which the assembly mode is not checked.
+"""Distance from the plane y = 0, as a share of l7, below which the assembly mode is not checked.
 
-Closer to the plane, joint positions with an error of 1e-4 rad may have no assembly.
+Closer to the plane, forward kinematics may have no solution if the joint positions have an error of
+1e-4 rad.
 """
 
 
@@ -76,8 +77,8 @@ def both_sides(machine: Machine) -> BothSides:
     The new region is the smallest box around the region of ``machine`` and its mirror image.
 
     Raises:
-        ConfigurationError: If the machine is no TPM, or if it is not in its modes at a corner of
-            the region or at a point next to y = 0.
+        ConfigurationError: If the machine is no TPM, or if a corner of the region, or a point next
+            to y = 0, is beyond a singularity or a motor's stop.
         UnreachableError: If a corner of the region, or a point next to y = 0, cannot be reached.
     """
     if not isinstance(machine, TPM):

@@ -86,9 +86,15 @@ def pose_at(
 
 
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
-    """Compute the torques for rates (rad/s), their changes (rad/s^2) and gravity (m/s^2).
+    """Compute the motors' torques, N m.
 
-    Weight equals the inertial force of an additional acceleration by -gravity.
+    Args:
+        pose: Configuration.
+        rates: Joint velocities, rad/s.
+        changes: Joint accelerations, rad/s^2.
+        gravity: Acceleration of gravity, m/s^2. Subtracting it from the accelerations of all points
+            has the same effect as adding the weights.
+        m: Constants of the bodies.
     """
     turn, moved = velocities(pose, rates)
     elbows, (cx, cz), (px, py, pz) = accelerations(pose, rates, changes, turn, moved)
@@ -172,9 +178,9 @@ def potential(pose: Pose, gravity: Triple, m: Inertia) -> Numbers:
 
 
 def velocities(pose: Pose, rates: Triple) -> tuple[Numbers, tuple[Triple, Triple, Triple]]:
-    """Compute l7 times the rate of beta, and the rates of the vectors B_iC_i, m/s.
+    """Compute l7 times the angular velocity of link 7, and the rates of the vectors B_iC_i, m/s.
 
-    All of them follow from the first derivatives of the closures.
+    These velocities follow from the first derivatives of the closures.
     """
     (c1, c2, c3), (s1, s2, s3), (u1, u2, u3), f = pose.cos, pose.sin, rates, pose.factors
     x, z, turn = _resolve(pose, f.leg1 * u1, f.leg2 * u2, f.leg3 * u3)
@@ -216,14 +222,14 @@ def accelerations(
 
 
 def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
-    """Solve B_iC_i . a_i = h_i for the motion of C1 and the turn of link 7.
+    """Solve B_iC_i . a_i = h_i for the motion of C1 and the rotation of link 7.
 
-    Here a_i is the velocity or the acceleration of C_i; the acceleration of C_3 is taken without
-    its centripetal part.
+    If the results are velocities, a_i is the velocity of C_i. If the results are accelerations, a_i
+    is the acceleration of C_i, for C_3 without the centripetal part.
 
     Returns:
-        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z, and l7 beta' (m/s) or
-        l7 beta'' (m/s^2).
+        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z. l7 times the angular
+        velocity (m/s) or angular acceleration (m/s^2) of link 7.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     x, z = (r2z * h1 - r1z * h2) * pose.per_planar, (r1x * h2 - r2x * h1) * pose.per_planar
@@ -231,7 +237,13 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
 
 
 def gather(pose: Pose, at_c: _Pair, at_p: Triple) -> Triple:
-    """Compute the motor torques J^T f that balance a force at C1, (x, z) N, and one at P, N."""
+    """Compute the motor torques (N m) that exert a force at C1 and a force at P.
+
+    Args:
+        pose: Configuration.
+        at_c: Force at C1 along x and z, N.
+        at_p: Force at P, N.
+    """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
     rod3 = (f.cos_beta * py - f.sin_beta * px) * pose.per_k  # its force, over l4

@@ -13,15 +13,18 @@ from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, Z, three
 
 
 class Inertia(NamedTuple):
-    """Constants of the dynamics; :mod:`tpm_gym.mechanism.inertia` defines b and :class:`Swing`.
+    """Constants of the dynamics.
+
+    The coupling constant of a bar (b in :mod:`tpm_gym.mechanism.inertia`) is the mass that couples
+    the velocities of the bar's two ends in its kinetic energy.
 
     Attributes:
         motors: For each leg, moment of inertia of the arm and of the rods' near ends about the
             motor's axis, kg m^2.
-        weights: For each leg, mass at B_i minus ``couples``, kg.
-        couples: For each leg, sum of the constants b of its rods B_iC_i, kg.
+        weights: For each leg, mass at B_i minus the leg's entry of ``couples``, kg.
+        couples: For each leg, sum of the coupling constants of its rods B_iC_i, kg.
         link3: Mass at C1, kg.
-        link7: Constant b of link 7, kg.
+        link7: Coupling constant of link 7, kg.
         platform: Mass at P, kg.
         swing1: Inertia of the swing of leg 1, about x.
         swing3: Inertia of the swing of leg 3, about y.

@@ -1,7 +1,8 @@
 """Compiled loops over many TPMs (:mod:`tpm_gym.mechanism.loops`).
 
-A row of ``built`` (b, 23) holds l1 to l7 (m) and the constants of the dynamics. ``machine`` (9,)
-holds the signs of the assembly mode (2) and of the working mode (4), and gravity.
+The loops have two arguments that depend on the mechanism. ``built`` has a row of 23 numbers for
+each machine: l1 to l7 (m), and the 16 constants of the dynamics. ``machine`` has nine numbers: two
+signs of the assembly mode, four signs of the working mode, and three components of gravity (m/s^2).
 """
 
 from tpm_gym.arrays import FloatArray

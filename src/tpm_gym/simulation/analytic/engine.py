@@ -64,7 +64,7 @@ class AnalyticEngine:
 
     Attributes:
         least_steps: Smallest number of time steps in a control period, because accelerations are
-            computed from the last three points of a path.
+            computed from the positions at the ends of the last three time steps.
         torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
             ``physics.torques`` is ``"every"``.
 
@@ -282,9 +282,12 @@ class AnalyticEngine:
         return over
 
     def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
-        """Compute the torques (r, m, 3) N m for joint positions ``theta`` (r, m + 2, 3) rad.
+        """Compute the torques of some robots in the last m time steps, (r, m, 3) N m.
 
-        The last m forces of ``push`` (r, K, 3) N act on P.
+        Args:
+            rows: (r,) indices of the robots.
+            theta: (r, m + 2, 3) rad, joint positions at the ends of the last m + 2 time steps.
+            push: (r, K, 3) N, force of objects on P in each of K time steps; the last m are used.
         """
         joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]

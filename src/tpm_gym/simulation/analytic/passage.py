@@ -39,12 +39,13 @@ In the plane, the inverse inertia is singular. With the compliance, the torques 
 
 
 class _Dynamics(NamedTuple):
-    """Dynamics of P: mass dv/dt + bias = rate^T torque, with theta_dot = rate v.
+    """Dynamics of P at velocity v: mass dv/dt + bias = rate^T torque, with theta_dot = rate v.
 
     Attributes:
         rate: Inverse Jacobian K, (r, 3, 3) rad/m.
         inverse: Inverse of the mass, (r, 3, 3) 1/kg.
-        bias: Force that carries the weight and the velocity-dependent loads, (r, 3) N.
+        bias: Force on P that balances the weight and the velocity-dependent forces, (r, 3) N. With
+            this force from the motors, v would stay constant.
     """
 
     rate: FloatArray
@@ -57,12 +58,12 @@ class _Lifted(NamedTuple):
 
     Attributes:
         points: Points mirrored to this side, at least _LIFT away from the plane, (r, 3) m.
-        side: Factors (r, 3): -1 for the component normal to the plane if the point was mirrored,
-            else 1.
+        side: Factors that mirror a vector in the same way as its point, (r, 3): -1 for the
+            component normal to the plane if the point was mirrored, else 1.
         theta: Joint positions at ``points``, (r, 3) rad.
-        own_rate: Inverse Jacobian K at ``points``, (r, 3, 3) rad/m, with theta_dot = K v.
-        rate: K at the original points, (r, 3, 3) rad/m. Its column for the direction normal to the
-            plane is proportional to the distance from the plane.
+        own_rate: Inverse Jacobian K at ``points``, (r, 3, 3) rad/m.
+        rate: Inverse Jacobian K at the original points, (r, 3, 3) rad/m. Its column for the
+            direction normal to the plane is proportional to the distance from the plane.
     """
 
     points: FloatArray

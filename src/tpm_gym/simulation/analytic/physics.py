@@ -17,12 +17,12 @@ class Physics(Numerics):
     Attributes:
         time_step: Time step, s; the control period must have a whole number of time steps, 3 or
             more.
-        torques: Time steps in which the torques of ideal motors are computed and compared with
-            their largest torques. ``"none"``: torques are not limited, and are NaN in the State.
-            ``"last"``: the last time step of a control period; but all its time steps if, in the
-            last one, a motor's torque is above half of the motor's largest torque. ``"every"``: all
-            time steps. For servo drives, and for robots that need forward dynamics, torques are
-            always computed and limited in all time steps.
+        torques: Time steps in which the torques of ideal motors are computed and compared with the
+            motors' largest torques. ``"none"``: torques are not limited, and are NaN in the State.
+            ``"last"``: the last time step of a control period. If a motor's torque in this time
+            step is above half of the motor's largest torque, the other time steps of the period are
+            checked too. ``"every"``: all time steps. For servo drives, and for robots that need
+            forward dynamics, torques are always computed and limited in all time steps.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -166,9 +166,9 @@ def _with_objects(
 ) -> tuple[Symmetric, Vector]:
     """Add the inertia and the forces of objects.
 
-    A horizontal force on P against the motion of P is friction. It is assumed proportional to the
-    velocity at the end of the time step. With the velocity at the beginning, friction could
-    reverse the motion, and P would oscillate.
+    A horizontal force on P that opposes the motion of P is treated as friction. This friction is
+    assumed proportional to the velocity of P at the end of the time step. If it were computed from
+    the velocity at the beginning, friction could reverse the motion, and P would oscillate.
     """
     (x, y, z), carried = row_of(course[5], row), course[6][row]
     u, v, _ = plus(row_of(course[3], row), row_of(course[4], row), -1.0)
@@ -217,8 +217,8 @@ def modes_left(
 
     Args:
         position: (r, 3) m, P by forward kinematics; NaN if there is no assembly.
-        side: (2, r) whether P, predicted from the joint velocities and from its own velocity,
-            stays on its side of the singularity.
+        side: (2, r) whether P stays on its side of the singularity, for two predictions of P: one
+            from the joint velocities, and one from the velocity of P.
         working: (r,) whether the robot is in its working mode.
         before: (r,) mode that was left earlier.
     """
@@ -264,9 +264,9 @@ def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
 
 @compiled
 def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> Vector:
-    """Solve mass @ u = impulse - limit * signs for the joints whose sign is not 0.
+    """Solve mass @ u = impulse - limit * signs for u, where ``signs`` are the assumed signs of u.
 
-    At the other joints, u is 0.
+    If an entry of ``signs`` is 0, this entry of u is 0, and its equation is left out.
     """
     (a, b, c, d, e, f), (p, q, r) = mass, (abs(signs[0]), abs(signs[1]), abs(signs[2]))
     own = a * p + 1 - p, b * p * q, c * p * r, d * q + 1 - q, e * q * r, f * r + 1 - r

@@ -1,21 +1,21 @@
 """Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
-**Level faces.** The solver limits the friction force of a contact to mu N (coefficient times normal
-force) along each of two directions. At 45 degrees to these directions, friction is sqrt(2) times
-too strong, and it does not oppose the slip. On a level face the directions are the world's x and
-y, and Bullet can scale both limits for each body. For a slipping contact, this module scales both
-limits so that a corner of the box lies on the cone, opposite to the slip. For a sticking contact,
-the limit along x follows from the cone and the last force along y, and vice versa. Without a last
-force, the box lies inside the cone.
+**Level faces.** The solver limits the friction force of a contact to mu * N (coefficient times
+normal force) along each of two directions. At 45 degrees to these directions, friction is sqrt(2)
+times too strong, and it does not oppose the slip. On a level face the directions are the world's x
+and y, and Bullet can scale both limits for each body. For a slipping contact, this module scales
+both limits so that a corner of the box lies on the cone, opposite to the slip. For a sticking
+contact, the limit along x follows from the cone and the last force along y, and vice versa. Without
+a last force, the box lies inside the cone.
 
 **Slides.** All points of a contact share these scales, and contacts between objects have no scales.
 So this module adds the friction that was missing in the last time step, as a force and a torque.
-The missing friction is mu N against the slip of each point, minus the solver's friction.
+The missing friction is mu * N against the slip of each point, minus the solver's friction.
 
-**Upright faces.** The solver takes N from a solution without friction. But a block that the lip
-pushes leans on the lip only because the table brakes it. In a solution without friction N is 0, so
-the solver allows no friction at the lip. So this module computes the missing friction from the last
-N, and adds it as a force.
+**Upright faces.** The solver takes N from a solution without friction. But when the lip pushes a
+block, the block presses on the lip only because friction at the table brakes the block. In a
+solution without friction, N is 0 at the lip, so the solver allows no friction there. So this module
+computes the missing friction from N in the last time step, and adds it as a force.
 
 Some errors remain (measured in ``tests/simulation/test_friction.py``). The scales and the added
 forces lag by one time step, since they are computed from the last one. The smaller scale never
@@ -52,8 +52,8 @@ _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the
 _Push = tuple[Vector, float]
 """Record of the friction force that was added to a contact in a time step: two entries, N.
 
-The added force has two parts (see ``compiled.friction_force``). The first entry is the second part.
-The second entry is the largest size of the added force that the contact forces allow.
+The first entry is the steady part of the added force (see ``compiled.friction_force``). The second
+entry is the largest size of the added force that the contact forces allow.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)

@@ -138,7 +138,7 @@ class Robot:
                 self._client.changeVisualShape(*place, rgbaColor=urdf.COLOURS[largest.colour])
 
     def place(self, angles: Mapping[str, float]) -> None:
-        """Set the joint positions (rad) at rest, by joint name."""
+        """Set joint positions (rad), by joint name, and set the joint velocities to zero."""
         for name, angle in angles.items():
             self._client.resetJointState(*self.joints[name], angle, 0.0)
 

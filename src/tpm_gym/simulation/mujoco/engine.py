@@ -50,8 +50,8 @@ class MujocoEngine:
 
     Args:
         gui: Whether to open MuJoCo's viewer.
-        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the one that the environment
-            variable ``MUJOCO_GL`` names. If it names none, the first one that works is used.
+        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``. If None, the renderer that the environment
+            variable ``MUJOCO_GL`` names; if it names none of the three, the first that works.
         physics: A :class:`Physics` or a mapping of its attributes.
         drive: Servo drives of the motors; None for ideal drives.
 

@@ -31,8 +31,8 @@ class Pictures:
     """Renderer of the scene. It opens an OpenGL context for the first picture of each size.
 
     Args:
-        renderer: One of :data:`RENDERERS`; None for the one that the environment variable
-            ``MUJOCO_GL`` names. If it names none, the first one that works is used.
+        renderer: One of :data:`RENDERERS`. If None, the renderer that the environment variable
+            ``MUJOCO_GL`` names; if it names none of these, the first that works.
 
     Raises:
         ConfigurationError: If ``renderer`` is another name.
@@ -131,8 +131,8 @@ def aim(own: mujoco.MjvCamera, camera: Camera) -> None:
 def _opengl(renderer: str | None, width: int, height: int) -> Any:
     """Open an OpenGL context for pictures of this size.
 
-    If ``renderer`` is None, the environment variable ``MUJOCO_GL`` names the backend. If it names
-    none of :data:`RENDERERS`, the first backend that works is used.
+    If ``renderer`` is None, the environment variable ``MUJOCO_GL`` names the backend. If the
+    variable has none of the names in :data:`RENDERERS`, the first backend that works is used.
     """
     asked = renderer or os.environ.get("MUJOCO_GL", "").lower()
     names = [asked] if asked in RENDERERS else RENDERERS

@@ -2,10 +2,10 @@
 
 Ideal motors reach their references exactly, as far as their largest torque allows. So an ideal
 motor is a constraint on the velocity at the end of the time step, with a limited force. Dry
-friction in MuJoCo is such a constraint, with velocity zero. The first half of a time step
-(``mj_step1``) creates a row of the solver for each friction constraint, and the second half
-(``mj_step2``) computes the forces. Between the two halves, this module sets the target velocities
-of the rows.
+friction in MuJoCo is a constraint of this kind, with the target velocity zero. So this module uses
+dry friction with another target velocity as ideal motor, and also as the cup's spring. The first
+half of a time step (``mj_step1``) creates the friction constraints. Then this module sets their
+target velocities. The second half (``mj_step2``) computes the forces.
 """
 
 from __future__ import annotations

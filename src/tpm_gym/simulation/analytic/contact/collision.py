@@ -44,7 +44,7 @@ _ZERO: Vector = (0.0, 0.0, 0.0)
 _UP: Vector = (0.0, 0.0, 1.0)
 
 _Place = tuple[int, int]
-"""Index of a contact in the list, and its slot: the index of its force of the last time step."""
+"""Two indices of a contact: in the list of contacts, and in the stored forces (its slot)."""
 _Pair = tuple[tuple[int, int], float]
 """Indices of the bodies a and b, and the Coulomb coefficient between them."""
 
@@ -315,7 +315,15 @@ def _touch_face(
 
 @compiled
 def _overlap(box: _Box, first: int, second: int, foot: Vector) -> tuple[float, float]:
-    """Return the lowest and highest height (m) above ``foot`` at which lip and side face touch."""
+    """Return the lowest and highest height (m) at which the lip's side touches a side face.
+
+    Args:
+        box: Object.
+        first: Index of one of the two axes of the object that are parallel to the face.
+        second: Index of the other axis.
+        foot: Point of the lip's rim, relative to the object's centre, m; the heights are above this
+            point.
+    """
     low, high = 0.0, CUP.bellows
     for k in (first, second):
         rise, at, half = box.frame[k][2], dot(box.frame[k], foot), box.half[k]
@@ -362,9 +370,13 @@ def _collide_boxes(
 
 @compiled
 def _cross_edges(one: _Box, two: _Box, normal: Vector, i: int, j: int) -> Frame:
-    """Return the vectors (m) from both centres to the nearest points of two edges.
+    """Find the points at which an edge of ``one`` and an edge of ``two`` are nearest to each other.
 
-    The edges are parallel to axis i of ``one`` and to axis j of ``two``. A third vector is zero.
+    The edges are parallel to axis i of ``one`` and to axis j of ``two``.
+
+    Returns:
+        Vector (m) from the centre of ``one`` to the point on its edge, vector from the centre of
+        ``two`` to the point on its edge, and a zero vector.
     """
     a, b, (p, q) = one.middle, two.middle, (one.frame[i], two.frame[j])
     for k in range(3):

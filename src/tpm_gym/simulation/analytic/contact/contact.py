@@ -99,16 +99,16 @@ class Contact:
     def advance(
         self, rows: IntArray, route: Route, vacuum_on: BoolArray, last: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Simulate K time steps on some tables.
+        """Simulate the time steps of ``route`` on some tables.
 
         Args:
             rows: (r,) indices of the tables.
             route: Motion of point P.
             vacuum_on: (r,) whether the vacuum is on.
-            last: Number m of time steps at the end whose forces are returned.
+            last: Number of time steps, at the end of ``route``, for which forces are returned.
 
         Returns:
-            Force (r, m, 3) N of cup and objects on the platform in each time step, machine's
+            Force (r, last, 3) N of cup and objects on the platform in each time step, machine's
             frame. It does not include weight and inertia of a cup that does not slide, because the
             machine's dynamics include them. Mass (r,) kg of the held objects.
         """

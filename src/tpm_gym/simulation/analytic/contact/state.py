@@ -85,7 +85,8 @@ class Setting(NamedTuple):
 
     Attributes:
         half: (k, 3) m, half edge lengths of the objects.
-        table: Lowest and highest x of table and belt, and half their width, m.
+        table: Three bounds of the surface that table and belt form together, m: lowest x, highest
+            x, and highest y (half of the width).
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
         turn: Signs (1 or -1). The components of a vector in the machine's frame times these signs

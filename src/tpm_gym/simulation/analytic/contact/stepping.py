@@ -38,7 +38,7 @@ _FREE_CUP = 4 * CUP_MASS
 """Mass of an empty cup in the solver, kg.
 
 It is larger than the cup's true mass and similar to an object's mass, so that the solver converges
-several times faster. The spring can accelerate this mass at 300 m/s^2.
+several times faster. The largest force of the cup's spring can accelerate this mass at 300 m/s^2.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
@@ -55,15 +55,16 @@ def advance(
     push: FloatArray,
     carried: FloatArray,
 ) -> None:
-    """Simulate K time steps on some tables.
+    """Simulate the time steps of ``path`` on the tables ``rows``.
 
-    The arguments rows, path and on are explained in :class:`.contact.Contact`.
+    ``rows``, ``path`` and ``on`` are the arguments ``rows``, ``route`` and ``vacuum_on`` of
+    :meth:`.contact.Contact.advance`.
 
     Args:
         tables: State of all tables; changed.
         earlier: Output: state of the simulated tables at the beginning of the control period.
-        push: (r, m, 3) N, force on the platform in the last m time steps, machine's frame; output,
-            initially zero.
+        push: (r, m, 3) N, force on the platform in the last m time steps of ``path``, machine's
+            frame; output, initially zero.
         carried: (r,) kg, masses of the held objects at the end; output, initially zero.
     """
     steps, skipped, turn = len(path.weights), len(path.weights) - push.shape[1], setting.turn
@@ -160,7 +161,11 @@ def _copy(tables: Tables, copy: Tables, row: int) -> None:
 
 @compiled
 def _place(path: Route, i: int, setting: Setting, points: FloatArray) -> None:
-    """Write P (m, world) one time step before the path, at its beginning, and after each step."""
+    """Write the positions of P on a robot's path to ``points`` (m, world).
+
+    The first position is one time step before the path, and the second is at its beginning. The
+    others are at the ends of the time steps.
+    """
     turn, origin = setting.turn, setting.origin
     put_row(points, 0, _placed(row_of(path.before, i), turn, origin))
     put_row(points, 1, _placed(row_of(path.now, i), turn, origin))
