@@ -187,7 +187,7 @@ class Motion:
             yield Move(self._above(block, height), True)
 
     def _above(self, block: Block, clearance: float) -> FloatArray:
-        """Return P (machine's frame) with the lip ``clearance`` above a block's present place."""
+        """Return the position of P, machine's frame, for a lip ``clearance`` m above the block."""
         place = self._see(block.name, "position") + hanging(block)
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 

@@ -66,7 +66,7 @@ def timed(
 
 
 def _spans(squared: FloatArray) -> FloatArray:
-    """Return the times (N,) from point to point, for b (N + 1,) at the points."""
+    """Return the times (N,) between points; ``squared`` (N + 1,) is (ds/dt)^2 at the points."""
     speed = np.sqrt(squared)
     spans: FloatArray = 2 / (len(squared) - 1) / (speed[1:] + speed[:-1])
     return spans
@@ -84,11 +84,15 @@ def _cost(squared: FloatArray, begin: FloatArray, end: FloatArray) -> float:
 
 
 def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Return b (N + 1,), zero at both ends, with the least time plus heat (Newton's method)."""
+    """Minimise time plus heat by Newton's method.
+
+    Returns:
+        (ds/dt)^2 at the points, (N + 1,), zero at both ends.
+    """
     s = np.linspace(0.0, 1.0, len(begin) + 1)
     squared = s * (1 - s)
     heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
-    # The best scale: there the heat is a third of the time.
+    # At the best scale of the squared speeds, the heat is a third of the time.
     squared /= np.sqrt(3 * (_spans(squared) @ heat) / _spans(squared).sum())
     for _ in range(_STEPS):
         gradient, hessian = _derivatives(squared, begin, end)
@@ -109,7 +113,11 @@ def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
 def _derivatives(
     squared: FloatArray, begin: FloatArray, end: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in the inner values of b."""
+    """Compute derivatives of the cost with respect to ``squared[1:-1]``.
+
+    Returns:
+        Gradient (N - 1,) and Hessian (N - 1, N - 1).
+    """
     count, spans, torques = len(begin), _spans(squared), _torques(squared, begin, end)
     speed = np.sqrt(squared)
     weight = 1 + (torques**2).sum(axis=1)
@@ -118,7 +126,7 @@ def _derivatives(
     sides = ((0, begin), (1, end))
     slopes, heats = [], []
     for side, factors in sides:
-        # At rest the slope is infinite, but b is fixed there.
+        # At rest the slope is infinite, but ``squared`` is fixed there.
         own = np.where(speed[rows + side] > 0, speed[rows + side], np.inf)
         slopes.append(-(spans**2) * count / 4 / own)
         heats.append(2 * (torques * factors).sum(axis=1))
@@ -143,7 +151,10 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Return the smallest factor of all times with which no motor exceeds a limit, by bisection."""
+    """Find the smallest factor for the times with which every motor keeps its limits.
+
+    All times are multiplied by this factor. The search is a bisection.
+    """
 
     def fits(factor: float) -> bool:
         found = torques / factor**2 + rest
