@@ -241,7 +241,7 @@ class Simulation:
         Args:
             commands: (n, 3) m, machine's frame; the caller projects them into the region.
             vacuum: (n,) whether the vacuum is on.
-            noise: (n, 3) rad, noise of the encoder reading at the end; None for zero.
+            noise: (n, 3) rad, noise of the encoder reading after this period; None for zero.
 
         Raises:
             UnreachableError: If a command is out of reach; no robot has moved then.
@@ -331,15 +331,15 @@ class Simulation:
     def _mirrored(
         self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the plane normal to ``mirror_axis``.
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the mirror plane, seen from home.
 
-        A position of P and its mirror image have the same joint positions, so encoders do not show
-        on which side of the plane P is. The sign of a passive joint shows the side. A switch would
-        measure this sign on a real robot.
+        The plane is normal to ``mirror_axis``. A position of P and its mirror image have the same
+        joint positions, so encoders do not show on which side of the plane P is. The sign of a
+        passive joint's position shows the side. A switch would measure this sign on a real robot.
 
-        P may turn back at the plane although its path passes through the plane. If P and the end of
-        its path are then on different sides of the plane, the commands are mirrored too. This does
-        not change the joint positions on the path.
+        P may turn back at the plane although its commands lead through the plane. Then the path
+        ends on one side of the plane, and P is on the other side. So the commands are mirrored to
+        P's side. This does not change the joint positions on the path.
 
         Args:
             truth: (n, 3) m, P of the platform, world.

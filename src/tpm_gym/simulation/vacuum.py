@@ -57,8 +57,8 @@ def pressure_after(vacuum: float, time_step: float, pumped: bool) -> float:
 def holds(vacuum: Any, load: tuple[Any, Any]) -> Any:
     """Return whether a vacuum (Pa) can carry a load (tension and shear, N); floats or arrays.
 
-    The norm of pull and shear must not exceed vacuum times area. If cup and object are pressed
-    together, the pull is zero, and lip friction carries a part of the shear.
+    sqrt(tension^2 + shear^2) must not exceed the vacuum times the cup's area. If cup and object
+    are pressed together, the tension counts as zero, and lip friction carries a part of the shear.
     """
     tension, shear = load
     pull = (tension > 0) * tension

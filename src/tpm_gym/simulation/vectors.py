@@ -45,7 +45,7 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def onto(start: Vector, matrices: Any, row: int, a: Vector, sign: float = 1.0) -> Vector:
-    """Return start plus sign times the product of matrices[row], (3, 3), and the vector a."""
+    """Return ``start + sign * matrices[row] @ a``; ``matrices`` is an array (n, 3, 3)."""
     x, y, z = a[0] * sign, a[1] * sign, a[2] * sign
     m = matrices
     return (
@@ -94,7 +94,7 @@ def inverted(matrix: Symmetric) -> Symmetric:
 
 
 def solved(matrix: Symmetric, right: Vector) -> Vector:
-    """Return the solution x of matrix x = right."""
+    """Return the solution x of ``matrix @ x = right``."""
     return spread(inverted(matrix), right)
 
 
@@ -109,9 +109,9 @@ def length(a: Vector) -> float:
 
 @compiled
 def level_length(x: float, y: float) -> float:
-    """Return the length of a horizontal vector, with equal bits on all platforms.
+    """Return the length of a horizontal vector, with equal bits on all computers.
 
-    ``math.hypot`` may differ in the last bit between platforms.
+    ``math.hypot`` may differ in the last bit between computers.
     """
     return math.sqrt(x * x + y * y)
 

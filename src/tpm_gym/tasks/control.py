@@ -49,7 +49,11 @@ class Control(Protocol):
         """Convert points (n, 3) m to coordinates (n, 3) whose differences are actions."""
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Return the displacement of P at points (n, 3) m for unit actions, (n, 3, 3) m."""
+        """Return the derivative of P with respect to the action, at points (n, 3) m.
+
+        Returns:
+            Matrices (n, 3, 3), m. Column j belongs to component j of the action.
+        """
 
 
 class CartesianControl:
@@ -123,9 +127,9 @@ class JointControl:
     def _tried(
         self, current: FloatArray, theta: FloatArray, step: FloatArray, share: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return P (r, 3) m after a share (r,) of the increment, and P's displacement (r,).
+        """Return P (r, 3) m after a share (r,) of the increment, and the size (r,) of P's motion.
 
-        The displacement is the largest one of x, y and z, in units of the step limit. It is
+        The size is the largest displacement along x, y or z, in units of the step limit. It is
         infinite where the machine cannot be assembled in its modes.
         """
         point = self._machine.forward(theta + share[:, None] * step)

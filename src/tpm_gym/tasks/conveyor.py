@@ -45,8 +45,8 @@ class Conveyor(Task):
     The belt runs along x, at 0.05 to 0.20 m/s, drawn for each episode. The block comes within reach
     in the first second. The camera shows it 3 control steps late, in the observation and in the
     achieved goal. The goal lies in the tray, on the table beyond the belt. With
-    ``goals="tempting"``, the conditioning is just above the safe threshold on a part of the block's
-    way on the belt, and on a part of the line along x through the goal in the tray.
+    ``goals="tempting"``, the robot's lowest conditioning is just above the safe threshold on each
+    of two lines along x: the block's way on the belt, and the line in the tray through the goal.
     """
 
     block = Block()
@@ -89,7 +89,7 @@ class Conveyor(Task):
 
     @cached_property
     def _floor(self) -> tuple[FloatArray, FloatArray]:
-        """Corners (3,) m of the places where the block is picked up and put down."""
+        """Low and high corner (3,) m, world, of the box of block centres on belt and tray."""
         table, hung = self.on_table(self.block), hanging(self.block)
         ends = self.machine.mount.to_world(np.array([table.low, table.high])) - hung
         return ends.min(axis=0), ends.max(axis=0)

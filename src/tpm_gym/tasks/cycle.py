@@ -23,14 +23,14 @@ __all__ = ["Cycle"]
 
 STROKE: Final = 0.305
 RISE: Final = 0.025
-"""Lengths of the way of P: along x (STROKE), and up and down at both ends (RISE), m."""
+"""Size of the way of P, m: STROKE along x; RISE up at one end and down at the other end."""
 BLEND: Final = 0.050
 """Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
 
 The curvature is zero at both ends of a corner, so that the acceleration does not jump.
 """
 SPEED: Final = 5.0
-"""Largest speed of the command along x and z, m/s; the motors turn at up to 20 rad/s there."""
+"""Largest speed of the command along x and z, m/s. At this speed, motors turn at up to 20 rad/s."""
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
@@ -46,7 +46,7 @@ to brake along x and z at the same time.
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth of P below the gate, minus the tolerance, at which the reward term is -1, m."""
+"""Depth, m, at which the reward term is -1: depth of P below the gate minus the tolerance."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""
@@ -171,7 +171,7 @@ class Cycle(Task):
         return goal
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the box of goals at each end, as low and high corner (3,) m, world, over all y."""
+        """Return the box of all goals at each end of the way: low and high corner (3,) m, world."""
         del block
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []

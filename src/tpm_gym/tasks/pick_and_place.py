@@ -22,7 +22,7 @@ CLEARANCE = 0.028
 The height is no multiple of the tolerance, so that rounding errors do not decide about success.
 """
 RELEASE_HEIGHT = 0.0005
-"""Height over a goal on the table, m, to which the expert carries the block to release it.
+"""Commanded height of the block over a goal on the table, m, when the expert releases the block.
 
 The weight stretches the cup by 0.4 to 0.5 mm, so that the block is let go just above the table.
 A block that is pressed on the table has forces of friction that each engine computes differently
@@ -58,7 +58,7 @@ class PickAndPlace(Task):
 
     @cached_property
     def _regions(self) -> dict[str, list[Region]]:
-        """Regions of P with the block in the cup, at the start and at the goal."""
+        """Regions of P while the cup holds the block: at a start ("object"), at a goal ("goal")."""
         table = self.on_table(self.block)
         x, y, level = table.high
         air = Region(self.machine.goal_region.low, (x, y, level - sampling.APART))

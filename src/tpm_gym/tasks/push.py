@@ -19,7 +19,7 @@ from tpm_gym.tasks.task import Entry, Task, dense
 __all__ = ["Push"]
 
 CLEARANCE: Final = 0.008
-"""Height of the arriving lip over the block's top; then its distance from the pushed face, m."""
+"""Gap between lip and block, m: first above the block's top, then beside the pushed face."""
 SHORTEST: Final = 0.060
 LONGEST: Final = 0.240
 """Bounds (SHORTEST, LONGEST) of the block's displacement along the pushed face's normal, m."""
@@ -84,7 +84,7 @@ class Push(Task):
         return rng.uniform(table.low, table.high, (_DRAWS, 2, 3))
 
     def _can_push(self, ways: FloatArray) -> BoolArray:
-        """Return whether a push is possible, (...,), for pairs of start and goal (..., 2, 3) m."""
+        """Return an array (...,): whether pairs of start and goal (..., 2, 3) m allow a push."""
         machine, along = self.machine, np.diff(ways, axis=-2)
         across, distance = np.moveaxis(np.sort(np.abs(along[..., 0, :2])), -1, 0)
         square = (distance >= SHORTEST) & (distance <= LONGEST) & (across <= SLOPE * distance)
@@ -95,9 +95,9 @@ class Push(Task):
         return fits
 
     def behind(self, place: FloatArray, way: FloatArray, gap: float) -> FloatArray:
-        """Return places of P from which the lip can push blocks along ``way``, (..., 3) m, world.
+        """Return places (..., 3) m, world, of P from which the lip can push blocks along ``way``.
 
-        The lip is behind the block there, and P as low as the region allows.
+        The lip is then behind the block, and P is as low as the region allows.
 
         Args:
             place: Centres (..., 3) m of the blocks.

@@ -111,16 +111,16 @@ def safe_draw(
     draw: Callable[[np.random.Generator], FloatArray],
     ways: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Draw points until the way of P that belongs to a point is safe; return this point, (3,).
+    """Draw points, and return the first one, (3,), for which the whole way of P is safe.
 
     Args:
         rng: Generator of the row.
         machine: The machine.
         goals: ``"tempting"`` if the lowest conditioning on the way must be just above the threshold
             of safe conditioning.
-        draw: Function that draws d points (d, 3).
-        ways: Function from points (d, 3) to the corners (d, k, 3) m, machine's frame, of the way of
-            each point. Ways are straight between their corners.
+        draw: Function that draws any number d of points, (d, 3).
+        ways: Function that returns the way of P for each of these points, as corners (d, k, 3) m,
+            machine's frame. Ways are straight between their corners.
 
     Raises:
         ConfigurationError: If no draw has such a way.
@@ -144,7 +144,11 @@ def _no_tempting(reason: str) -> ConfigurationError:
 
 
 def _limits(machine: Machine, near_singularity: bool) -> tuple[float, float]:
-    """Return the limits of the conditioning of points: the lowest value, and an upper bound."""
+    """Return two limits, low and high: points must have low <= conditioning < high.
+
+    ``low`` is the threshold of safe conditioning. ``high`` is just above it with
+    ``near_singularity``, else infinite.
+    """
     safe = machine.safe_conditioning
     return safe, safe + BAND if near_singularity else math.inf
 

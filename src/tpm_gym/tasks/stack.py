@@ -24,7 +24,7 @@ At this height, a carried block passes above a standing block.
 APART: Final = 0.045
 """Smallest distance between the centres of the blocks and of the goal on the table, m."""
 CLEAR: Final = 0.0005
-"""Smallest distance between the corners of two blocks, m."""
+"""Smallest gap between the two blocks at the start, m."""
 
 
 class Stack(Task):

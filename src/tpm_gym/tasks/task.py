@@ -181,7 +181,7 @@ class Task(ABC):
 
         Args:
             rngs: A generator for each episode. An episode draws from its own generator only, so
-                that it has the same numbers alone and among thousands.
+                that its values do not depend on the other episodes.
             chosen: Entries (r, ...) that the user has chosen, within reach. They are returned
                 unchanged, and sampled entries keep clear of them.
 
@@ -395,7 +395,7 @@ class Task(ABC):
         return low, high
 
     def on_table(self, block: Block) -> Region:
-        """Return the goal region of P, machine's frame, at which a held block is on the table."""
+        """Return the flat goal region of P, machine's frame, where a held block is on the table."""
         low, high = self.machine.goal_region.low, self.machine.goal_region.high
         touching = hanging(block) + (0.0, 0.0, block.height / 2)
         level = float(self.machine.mount.to_paper(touching)[2])
@@ -473,7 +473,7 @@ class Task(ABC):
         return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
-        """Return the region's centre and half size (m, world), full speed (m/s), full step (m)."""
+        """Return the region's centre and half size, m, world; limits of speed, m/s, and step, m."""
         region, mount = self.machine.region, self.machine.mount
         step = np.multiply(self.machine.step_limit, self.control_period / CONTROL_PERIOD)
         low, high = np.array(region.low), np.array(region.high)
@@ -564,7 +564,7 @@ def _turn(index: int, state: State) -> FloatArray:
 
 
 def _columns(entries: Sequence[Entry]) -> Any:
-    """Return the index that selects the columns of entries from the array of their source."""
+    """Return the index of the entries' columns in the array that their common source returns."""
     if entries[0].columns is None:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]

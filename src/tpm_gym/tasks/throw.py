@@ -31,8 +31,8 @@ BRAKING: Final = 0.050
 RUN_UP: Final = (1 / 3, 2 / 3, 1.0, 1.0, 1.0)
 """Lengths of the command's steps in the run-up, as shares of the last step.
 
-The last step switches the vacuum off. The path is a spline of three commands, so that with three
-equal steps the speed is constant in the last two control periods, until the cup lets go.
+The last step switches the vacuum off. The path in a control period depends on two steps. So three
+equal steps keep the speed constant in the last two control periods, until the cup lets go.
 """
 VENTED: Final = CUP.venting_time * math.log(CUP.vacuum / CUP.least_vacuum) / Task.control_period
 """Number of control periods from switching the vacuum off until the block is free."""
@@ -120,8 +120,8 @@ class Throw(Task):
     def _release(self, goal: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the place (..., 3) m of the release, and the run-up's last step along x (...,) m.
 
-        A block that falls by h meets the table with the impulse m sqrt(2 g h), and friction takes
-        mu sqrt(2 g h) from the speed v. Fall and slide cover v^2 / (2 mu g) + mu h along x.
+        When the block hits the table after a fall by h, friction (coefficient mu) reduces its speed
+        v by mu sqrt(2 g h). Fall and slide together cover v^2 / (2 mu g) + mu h along x.
         """
         low, high = self.reach_of(self.block)
         side = np.where(goal[..., 0] > (low[0] + high[0]) / 2, 1.0, -1.0)

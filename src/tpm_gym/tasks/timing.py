@@ -88,7 +88,7 @@ def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
     s = np.linspace(0.0, 1.0, len(begin) + 1)
     squared = s * (1 - s)
     heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
-    # The best scale: there the heat is a third of the time.
+    # At the best scale of the squared speeds, the heat is a third of the time.
     squared /= np.sqrt(3 * (_spans(squared) @ heat) / _spans(squared).sum())
     for _ in range(_STEPS):
         gradient, hessian = _derivatives(squared, begin, end)
@@ -118,7 +118,7 @@ def _derivatives(
     sides = ((0, begin), (1, end))
     slopes, heats = [], []
     for side, factors in sides:
-        # At rest the slope is infinite, but b is fixed there.
+        # At rest the slope is infinite, but ``squared`` is fixed there.
         own = np.where(speed[rows + side] > 0, speed[rows + side], np.inf)
         slopes.append(-(spans**2) * count / 4 / own)
         heats.append(2 * (torques * factors).sum(axis=1))
@@ -143,7 +143,10 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Return the smallest factor of all times with which no motor exceeds a limit, by bisection."""
+    """Find the smallest factor for the times with which every motor keeps its limits.
+
+    All times are multiplied by this factor. The search is a bisection.
+    """
 
     def fits(factor: float) -> bool:
         found = torques / factor**2 + rest

@@ -123,7 +123,7 @@ SURFACES: Final = {
 
 
 def grid_mesh(points: FloatArray) -> Mesh:
-    """Return the triangles between the points of m grids (m, a, b, 3) that are not NaN."""
+    """Join neighbouring points of grids (m, a, b, 3) to triangles; leave out NaN points."""
     real = ~np.isnan(points[..., 0])
     index = np.arange(real.size).reshape(real.shape)
     corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]

@@ -196,9 +196,10 @@ class Play:
     def _draw(
         self, place: int, title: str, names: tuple[str, ...], rows: Sequence[Any], length: int
     ) -> None:
-        """Show curves in the plot for these names and this length, and hide the other plots.
+        """Show curves in one plot at ``place``, and hide the other plots there.
 
-        The other plots are not removed, because a page may still have to process updates of them.
+        Each combination of ``names`` and ``length`` has its own plot. The other plots are not
+        removed, because a page may still have to process updates of them.
         """
         key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
         plots = self._plots[place]

@@ -36,9 +36,9 @@ class Worker:
             self._change.notify_all()
 
     def ask(self, name: str, job: Job) -> None:
-        """Run a job for a control that has changed, if a user has changed it.
+        """Run a job after a user has used a control of the page.
 
-        If a job of this thread has changed the control, do nothing.
+        Do nothing if this method is called because a job of this thread has changed the control.
         """
         if threading.current_thread() is not self._thread:
             self.put(name, job)

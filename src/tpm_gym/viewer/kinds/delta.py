@@ -24,7 +24,8 @@ _SHAPE: Final = (96, 96, 96)
 class DeltaKind(Kind):
     """Kind of a Delta.
 
-    Working modes are tuples of signs. Assembly modes are 1 (P below the elbows) and -1.
+    A working mode is a tuple of three signs, one for each leg: 1 if the elbow is out, else -1.
+    An assembly mode is 1 if P is below the elbows, and -1 if P is above them.
     """
 
     lists: Mapping[str, str] = {

@@ -27,7 +27,8 @@ class Margin:
     Attributes:
         distance: Distance from P, m.
         point: The singular position (3,) m, machine's frame.
-        factor: Name of the factor that is zero at this position.
+        factor: One of :data:`tpm_gym.analysis.singularity.FACTORS`: the name of the factor of a
+            Jacobian's determinant, or of the elevation, that is zero at ``point``.
     """
 
     distance: float
@@ -96,7 +97,8 @@ class Kind:
         lists: Labels of the lists in the panel, with an explanation each. The first list chooses
             the operation mode, and the last one the assembly mode. The lists between them, at most
             two, choose the working mode.
-        working: Working modes by the entries that are chosen in the lists for the working mode.
+        working: Working modes. A key is the tuple of the labels that the user chooses in the lists
+            of the working mode.
         assembly: Assembly modes by operation mode and label.
         lows: Lower ends of the motors' sliders in the panel, degrees. The slider of a linear motor
             goes from stop to stop instead.
@@ -160,7 +162,8 @@ class Kind:
         Names, and what each layer's function returns:
 
         - parallel, serial, constraint: meshes of singular surfaces, by name;
-        - aspects: a sequence of cells; workspace: cells;
+        - aspects: a sequence with one set of cells (``Cells``) for each aspect;
+        - workspace: one set of cells (``Cells``);
         - conditioning: a mesh, and the conditionings at its vertices;
         - margin: a :class:`Margin`, or None.
         """
@@ -169,10 +172,10 @@ class Kind:
 
 
 def elbows(out: Sequence[float]) -> dict[str, tuple[Any, ...]]:
-    """Return the signs of three legs by labels such as ``"out / in / out"``.
+    """Return the signs of a working mode's three legs for labels such as ``"out / in / out"``.
 
     Args:
-        out: For each leg, the sign with the elbow out.
+        out: For each leg, its sign in working modes in which the leg's elbow is out.
     """
     words = {"out": 1, "in": -1}
     return {
