@@ -77,9 +77,9 @@ class RotatedMode(_Mode):
         planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`. It gives
             the side on which rod 6 passes the point where rods 4a and 4b cross, as seen along y.
             Exception: if rods 4a and 4b, seen along y, are shorter than links 3 and 3', more than
-            half of the assemblies of link 3' can have the same sign. Then ``planar`` is -1 for one
-            half of the assemblies and 1 for the other half. The half with -1 has the smaller
-            products of the planar factor and |B1C1|^2, with B1C1 as seen along y.
+            half of the assemblies of link 3' can have the same sign. Then they are sorted by the
+            planar factor times |B1C1|^2 (B1C1 as seen along y): ``planar`` is -1 in the lower half
+            and 1 in the upper half.
         further: Sign that selects one of the two assemblies of link 3' with the same ``planar``: -1
             for the smaller tilt phi in [0, 2 pi), 1 for the larger tilt.
         sin_beta: Sign of sin(beta), and so of y.

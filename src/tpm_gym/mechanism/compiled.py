@@ -201,5 +201,5 @@ def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
-    """Reshape arrays: all axes of ``like`` but the last take the place of an array's first axis."""
+    """Replace the first axis of each array by the axes of ``like`` without its last axis."""
     return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)

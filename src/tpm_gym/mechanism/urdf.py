@@ -59,7 +59,7 @@ def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
 
     Args:
         mechanism: Links, joints and closures.
-        closure_frames: Whether to add the frames that :func:`loops_text` pairs.
+        closure_frames: Whether to add two frames for each closure, named in :func:`loops_text`.
     """
     root = Element("robot", name=mechanism.name)
     root.append(Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))

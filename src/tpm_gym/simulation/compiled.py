@@ -216,7 +216,7 @@ def distances(points: FloatArray, others: FloatArray) -> FloatArray:
 
 @kept
 def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return for each row whether any of its k places is outside the box of this place, (n,).
+    """Return for each row whether any of its k places is outside its box, (n,).
 
     A place with NaN is outside.
 

@@ -95,7 +95,7 @@ class Push(Task):
         return fits
 
     def behind(self, place: FloatArray, way: FloatArray, gap: float) -> FloatArray:
-        """Return places (..., 3) m, world, of P from which the lip can push blocks along ``way``.
+        """Return where P has to be, (..., 3) m, world, so that the lip can push along ``way``.
 
         The lip is then behind the block, and P is as low as the region allows.
 

@@ -54,7 +54,7 @@ class _Dynamics(NamedTuple):
 
 
 class _Lifted(NamedTuple):
-    """Kinematics at points on that side of the plane on which the machine's home is.
+    """Kinematics at points that are, like the machine's home, on one side of the singular plane.
 
     Attributes:
         points: Points mirrored to this side, at least _LIFT away from the plane, (r, 3) m.

@@ -140,7 +140,7 @@ class Contact:
         return np.concatenate(self._plain(), axis=1)
 
     def restore(self, saved: FloatArray) -> None:
-        """Restore all tables from the result of :meth:`save`."""
+        """Restore the state of all objects and contacts from the result of :meth:`save`."""
         first = 0
         for plain in self._plain():
             plain[:] = saved[:, first : first + plain.shape[1]]
