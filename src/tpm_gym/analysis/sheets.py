@@ -182,7 +182,7 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
 
 
 def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
-    """Return the curves of C1 on which a factor is zero: k curves of 256 steps, (k, 257).
+    """Return the curves of point C1 on which a singular factor is zero: k of 256 steps, (k, 257).
 
     Args:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.

@@ -277,7 +277,7 @@ def refuses_bad_actions_and_has_not_moved_then(make: Make) -> None:
 
 
 def clips_actions_and_leaves_them_as_they_are(make: Make) -> None:
-    """Compare the results of actions at the bounds of the action space and of larger actions."""
+    """Compare results of larger actions with those of actions at the bounds of the action space."""
 
     def run(env: Env, size: float) -> Any:
         env.reset(seed=10)

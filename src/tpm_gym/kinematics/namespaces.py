@@ -141,8 +141,8 @@ def by_rows(
 ) -> list[FloatArray]:
     """Call the function ``text`` for points (..., k), in blocks of n points.
 
-    The arguments of ``text`` are the k components of a block's points, each an array (n,), as one
-    tuple, and the namespace. Each result of ``text`` is a column (n,), a tuple of m columns, or a
+    ``text`` takes two arguments: a tuple of the k components of a block's points, each an array
+    (n,); and the namespace. Each result of ``text`` is a column (n,), a tuple of m columns, or a
     tuple of l such tuples.
 
     Returns:

@@ -412,7 +412,7 @@ def _check_recipe(config: TrainingConfig) -> None:
 def _check_device(device: str) -> None:
     """Refuse a device that PyTorch does not have.
 
-    PyTorch itself would refuse the device only after an earlier run in the folder is deleted.
+    PyTorch itself would refuse the device too late: an earlier run in the folder would be deleted.
     """
     import torch
 

@@ -30,7 +30,7 @@ SEALING = 0.160
 SLOW_ABOVE = CUP.seal_gap + 0.001
 """Height of the lip over a block, m; a gentle pick moves slowly below this height."""
 SLOW_SPEED = 0.025
-"""Speed of a gentle pick below ``SLOW_ABOVE``, m/s."""
+"""Speed of a gentle pick while the lip is lower than ``SLOW_ABOVE`` over the block, m/s."""
 
 
 def hanging(block: Block) -> FloatArray:

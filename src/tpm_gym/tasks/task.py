@@ -162,7 +162,7 @@ class Task(ABC):
         self._sources = [(source, _columns(list(entries))) for source, entries in groups]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the attributes, without entries of observations: functions cannot be pickled."""
+        """Return the attributes without those that hold functions, which cannot be pickled."""
         own = vars(self).items()
         return {name: value for name, value in own if name not in ("entries", "_sources")}
 

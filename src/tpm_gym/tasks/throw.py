@@ -89,7 +89,7 @@ class Throw(Task):
         return sampling.safe_draw(rng, self.machine, self.goals, draw, self._lane)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the boxes beyond both ends of the region into which the robot can throw.
+        """Return lower and upper corners (m) of the goals' boxes, beyond both ends of the region.
 
         Raises:
             ConfigurationError: If there is no such box.

@@ -34,7 +34,8 @@ The joint positions at the three points give the second derivative of the joint 
 _COMPLIANCE: Final = 1e-8
 """Compliance of ideal motors, as a fraction of the trace of the inverse inertia at their axes.
 
-In the plane, the inverse inertia is singular. With the compliance, the torques are still unique.
+In the singular plane y = 0, the inverse inertia is singular. With the compliance, the torques are
+unique there too.
 """
 
 
