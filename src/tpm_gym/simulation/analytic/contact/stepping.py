@@ -101,7 +101,7 @@ def read(
     held: IntArray,
     vacuum: FloatArray,
 ) -> None:
-    """Copy the state of objects and cups to ``position`` ... ``vacuum``, as in :class:`.contact.Reading`."""
+    """Copy the state of objects and cups to the arrays of a :class:`.contact.Reading`."""
     for row in range(len(cups)):
         held[row], vacuum[row] = int(cups[row]["held"]), cups[row]["vacuum"]
         for index in range(objects.shape[1]):
