@@ -169,8 +169,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the final test in each of its two engines; 0 for no test. Only a training in
-    --engine analytic has this test. It runs the best policy in that engine and in PyBullet."""
+    """Episodes of the best policy's test, in that engine and in PyBullet, after a training in
+    --engine analytic; 0 for no test."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so

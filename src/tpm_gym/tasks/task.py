@@ -448,7 +448,13 @@ class Task(ABC):
             ("offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near),
             ("velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed),
             ("tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0)),
-            ("held", "-", f"vacuum from 0 to 1, by a gauge, if the {name} is held", (0.5,), (0.5,)),
+            (
+                "held",
+                "-",
+                f"vacuum by a gauge, 0 to 1; 0 if the {name} is not held",
+                (0.5,),
+                (0.5,),
+            ),
         )
         ends = np.cumsum([9 + 12 * index, *(len(row[-1]) for row in rows)]).tolist()
         entries = tuple(
