@@ -28,12 +28,12 @@ from typing import Any, Final
 import numpy as np
 from engine_matrix import DRIVES
 from shared import ROOT, describe, make_parser, publish, table
+from studies.plan import Run
 
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.estimates import wilson
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
-from tpm_gym.learning.run_folder import is_finished
 
 RECORD = ROOT / "docs" / "records" / "transfer.json"
 PAGE = ROOT / "docs" / "transfer.md"
@@ -73,13 +73,11 @@ class Cell:
 def commands(runs: Path, seeds: int) -> Iterator[list[str]]:
     """Yield the commands of the trainings that are left."""
     for (env_id, engine, drive, steps), seed in product(TRAININGS, range(seeds)):
+        options = ["--engine", engine, "--drive", drive, "--seed", str(seed)]
+        options += ["--test-episodes", "0", *(["--steps", str(steps)] if steps else [])]
         folder = runs / f"{env_id}-{engine}-{drive}-{steps or 'all'}-s{seed}"
-        if is_finished(folder):
-            continue
-        options = {"env": env_id, "engine": engine, "drive": drive, "algo": "ppo", "seed": seed}
-        options |= {"run": folder, "test-episodes": 0} | ({"steps": steps} if steps else {})
-        words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-        yield [sys.executable, "-m", "tpm_gym.learning", "train", *words, "--overwrite"]
+        for _, *words in Run(folder, env_id, "ppo", tuple(options), ()).left():
+            yield [sys.executable, "-m", "tpm_gym.learning", *words]
 
 
 def train_all(runs: Path, seeds: int, jobs: int) -> None:

@@ -97,14 +97,14 @@ def require_mode(branch: object, kind: type[_Mode]) -> None:
 
 
 ASSEMBLY_MODES = tuple(AssemblyMode(*signs) for signs in product((-1, 1), repeat=2))
-"""All branches of the forward kinematics, in the order of the slots of :func:`forward_all`."""
+"""Branches of the forward kinematics, all 4, in the order of the slots of :func:`forward_all`."""
 
 ROTATED_MODES = tuple(RotatedMode(*signs) for signs in product((-1, 1), repeat=3))
-"""All branches of the forward kinematics with link 3' turned, in the order of the slots of
+"""Branches of the forward kinematics with link 3' turned, all 8, in the order of the slots of
 :func:`tpm_gym.kinematics.rotated.forward_rotated`."""
 
 WORKING_MODES = tuple(WorkingMode(*signs) for signs in product((-1, 1), repeat=4))
-"""All branches of the inverse kinematics, in the order of the slots of :func:`inverse_all`."""
+"""Branches of the inverse kinematics, all 16, in the order of the slots of :func:`inverse_all`."""
 
 DEFAULT_ASSEMBLY = AssemblyMode(planar=-1, sin_beta=1)
 """Assembly mode of the environments: the platform is at y > 0, on the side z > 0 of the base."""
