@@ -259,11 +259,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         observations, infos = zip(*found, strict=True)
         if len(infos) == 1:
             return observations[0], infos[0]
-        joined = {
-            name: np.concatenate([observation[name] for observation in observations])
-            for name in observations[0]
-        }
-        return joined, _joined(infos, [part.core.count for part in self._parts])
+        counts = [part.core.count for part in self._parts]
+        return _joined(observations, counts), _joined(infos, counts)
 
     def render(self) -> tuple[Any, ...] | None:
         """Draw all environments; see :meth:`TPMEnv.render`."""
