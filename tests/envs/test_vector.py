@@ -94,6 +94,9 @@ def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode):
     assert ours.action_space == theirs.action_space
     for got, wanted in zip(ours.reset(seed=1), theirs.reset(seed=1), strict=True):
         assert_same(got, wanted)
+    assert ours.np_random_seed == theirs.np_random_seed
+    states = [[rng.bit_generator.state for rng in envs.np_random] for envs in (ours, theirs)]
+    assert states[0] == states[1]
     for step, actions in enumerate(actions_of(ours, 17)):
         got, wanted = ours.step(actions), theirs.step(actions)
         for one, other in zip(got, wanted, strict=True):
@@ -154,6 +157,7 @@ def test_what_is_saved_goes_on_equally(randomisation):
         make(PICK, 7, machine="wide").restore_state(moment)
     for again in (envs, other, envs):
         again.restore_state(moment)
+        assert again.np_random_seed == tuple(range(7))
         for actions, wanted in zip(course[30:], expected, strict=True):
             assert_same(again.step(actions)[0], wanted[0])
 

@@ -32,6 +32,7 @@ __all__ = [
     "Observation",
     "action_space",
     "compute_reward",
+    "seed_of",
 ]
 
 OBSERVATION_BOUND = 10.0
@@ -65,7 +66,7 @@ class EnvSnapshot:
     Attributes:
         kind: Task and options. Environments with other values cannot restore the snapshot.
         simulation: The simulation's part.
-        rngs: States of the n generators.
+        rngs: States of the n generators, with their seeds.
         columns: Arrays by name: goals and delayed actions. Vector environments add the lengths
             and ends of their episodes.
     """
@@ -359,7 +360,7 @@ class Core:
             EpisodeError: If no episode is running.
         """
         _ = self.state  # raises without an episode
-        rngs = [dict(rng.bit_generator.state) for rng in self.rngs]
+        rngs = [{**rng.bit_generator.state, "seed": seed_of(rng)} for rng in self.rngs]
         own = {"goals": self.goals, "pending": self._pending, "views": self._views, **columns}
         copies = {name: values.copy() for name, values in own.items()}
         return EnvSnapshot(self.kind, self._save_simulation(), rngs, copies)
@@ -381,7 +382,7 @@ class Core:
         """
         self.require_open()
         self.require_equal(snapshot)
-        self.rngs = [np.random.default_rng() for _ in snapshot.rngs]
+        self.rngs = [np.random.default_rng(state.get("seed")) for state in snapshot.rngs]
         for rng, state in zip(self.rngs, snapshot.rngs, strict=True):
             rng.bit_generator.state = state
         self.goals = snapshot.columns["goals"].copy()
@@ -435,6 +436,11 @@ class Core:
             self.simulation.close()
         elif snapshot is not None:
             self.simulation.restore(snapshot)
+
+
+def seed_of(rng: np.random.Generator) -> int:
+    """Return the seed that a generator was made with."""
+    return int(rng.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
 
 
 def _as_in_json(physics: Any) -> Any:

@@ -18,6 +18,7 @@ from tpm_gym.envs.core import (
     Observation,
     action_space,
     compute_reward,
+    seed_of,
 )
 from tpm_gym.envs.rendering import RENDER_MODES
 from tpm_gym.errors import ActionError, ConfigurationError, ModeChangeError
@@ -435,7 +436,8 @@ class TPMEnv(gym.Env[Observation, Action]):
                 happened then.
         """
         observation = self._core.restore(snapshot)
-        self._np_random = self._core.rngs[0]
+        (rng,) = self._core.rngs
+        self._np_random, self._np_random_seed = rng, seed_of(rng)
         return {name: values[0] for name, values in observation.items()}
 
 

@@ -19,6 +19,7 @@ from tpm_gym.envs.core import (
     Observation,
     action_space,
     compute_reward,
+    seed_of,
 )
 from tpm_gym.envs.rendering import RENDER_MODES
 from tpm_gym.errors import (
@@ -330,6 +331,16 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     def episode(self) -> IntArray:
         """(n,) number of episodes that were started or restored."""
         return np.concatenate([part.core.episode for part in self._parts])
+
+    @property  # type: ignore[misc]  # Gymnasium's can be set
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """Generators of the n environments; none before the first reset."""
+        return tuple(rng for part in self._parts for rng in part.core.rngs)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
+        """Seeds of the n generators."""
+        return tuple(map(seed_of, self.np_random))
 
     @property
     def goal(self) -> FloatArray:
