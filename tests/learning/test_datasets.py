@@ -165,6 +165,7 @@ def test_datasets_of_two_engines_have_two_names(engine):
         ("--env: give at least one", {"env": ()}),
         ("--kind: give at least one", {"kind": ()}),
         ("--seed 999999: must be at most 999988", {"seed": 999_999}),
+        ("--seed 999900: must lie in 0", {"seed": 999_900, "kind": ("random", "replay")}),
     ],
 )
 def test_what_cannot_be_collected_is_refused(tmp_path, message, changes):

@@ -31,7 +31,9 @@ from tpm_gym.learning.configuration import (
     UNSET,
     EnvOptions,
     GivenEnvOptions,
+    TrainingConfig,
     check_least,
+    complete,
     unset,
 )
 from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
@@ -133,6 +135,12 @@ class Dataset:
         """Folder of the dataset; Minari loads its subfolder ``data``."""
         return self.root / self.name
 
+    @property
+    def training(self) -> TrainingConfig:
+        """Training of kind replay; a ConfigError if there is no recipe or the seed is refused."""
+        seed, steps, options = self.config.seed, self.config.steps, self.config.env_options
+        return complete(TrainingConfig(env=self.env, seed=seed, steps=steps, env_options=options))
+
 
 def collect(config: CollectConfig, console: Console | None = None) -> list[Path]:
     """Collect the datasets of a configuration; return their folders.
@@ -152,6 +160,8 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     todo = [Dataset(config, env, kind, root) for env in envs for kind in config.kind]
     for dataset in todo:
         _require_free(dataset)
+        if dataset.kind == "replay":
+            _ = dataset.training  # refused before anything is written
     scores: dict[str, tuple[float, float]] = {}
     for dataset in todo:
         console.print(f"{dataset.name}: {config.episodes} episodes ...", markup=False)
@@ -220,9 +230,7 @@ def _episodes(dataset: Dataset, advance: Advance) -> Iterator[EpisodeBuffer]:
     if dataset.kind == "replay":
         from tpm_gym.learning import replay
 
-        yield from replay.episodes(
-            dataset.env, options, config.seed, config.episodes, config.steps, record
-        )
+        yield from replay.episodes(dataset.training, config.episodes, record)
         return
     count = min(config.episodes, BATCH) if options.in_batches else 1
     with closing(make_envs(dataset.env, count, **options.given())) as envs:

@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
 from tpm_gym.envs.vector import TPMVectorEnv
-from tpm_gym.learning.configuration import EnvOptions, TrainingConfig, complete
+from tpm_gym.learning.configuration import TrainingConfig
 from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.policies import TrainedPolicy
@@ -57,28 +57,23 @@ class _Moments(BaseCallback):
         return True
 
 
-def episodes(
-    env: str, options: EnvOptions, seed: int, count: int, steps: int, record: Record
-) -> list[Any]:
+def episodes(config: TrainingConfig, count: int, record: Record) -> list[Any]:
     """Train a policy, play episodes with it at several moments of the training, and return them.
 
     Args:
-        env: Id, or ``module:id``.
-        options: Options of the environments.
+        config: Complete configuration of the training. Its seed is also that of the first episode.
         count: Number of episodes, spread evenly over the moments.
-        seed: Seed of the training, and of the first episode.
-        steps: Steps of the training; UNSET for the recipe's number.
         record: Function that plays the episodes of a moment. Its arguments are environments,
             policy, number of episodes and first seed.
     """
-    config = complete(TrainingConfig(env=env, seed=seed, steps=steps, env_options=options))
+    options, seed = config.env_options, config.seed
     torch.set_num_threads(config.threads)
     found: list[Any] = []
     parts = [count * moment // MOMENTS for moment in range(MOMENTS + 1)]
     most = -(-count // MOMENTS) if options.in_batches else 1
     with (
         training_envs_of(config) as training_envs,
-        closing(make_envs(env, most, **options.given())) as envs,
+        closing(make_envs(config.env, most, **options.given())) as envs,
     ):
 
         def use(model: BaseAlgorithm, moment: int) -> None:
