@@ -159,9 +159,10 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     root = get_dataset_path() if config.out is UNSET else config.out
     todo = [Dataset(config, env, kind, root) for env in envs for kind in config.kind]
     for dataset in todo:
-        _require_free(dataset)
         if dataset.kind == "replay":
-            _ = dataset.training  # refused before anything is written
+            _ = dataset.training  # raises before anything is written
+    for dataset in todo:
+        _require_free(dataset)
     scores: dict[str, tuple[float, float]] = {}
     for dataset in todo:
         console.print(f"{dataset.name}: {config.episodes} episodes ...", markup=False)
