@@ -95,9 +95,19 @@ class Algorithm:
         return found
 
     def argument(self, given: Mapping[str, Any], name: str) -> Any:
-        """Return a constructor's argument, given or default; None if there is no such argument."""
-        parameters = inspect.signature(self.load_class()).parameters
-        return given.get(name, parameters[name].default if name in parameters else None)
+        """Return an argument of the constructor or of the policy: the given one, or the default.
+
+        Args:
+            given: Arguments of the constructor; ``policy_kwargs`` has those of the policy.
+            name: Name of the argument. The result is None if there is no such argument.
+        """
+        kind: Any = self.load_class()
+        policy, inner = kind.policy_aliases["MultiInputPolicy"], given.get("policy_kwargs", {})
+        for owner, own in ((kind, given), (policy, inner)):
+            parameters = inspect.signature(owner).parameters
+            if name in parameters:
+                return own.get(name, parameters[name].default)
+        return None
 
     def entries(self) -> Any:
         """Return the type of the algorithm's recipes, a TypedDict.

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, get_type_hints
+from typing import Any, get_type_hints
 
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -24,8 +24,6 @@ from tpm_gym.learning.algorithms import ALGORITHMS, NAMES
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.resources import RECIPES
 from tpm_gym.simulation.engine import require_engine
-
-_QUANTILES: Final = 25  # default of TQC's policy
 
 
 @dataclass(frozen=True)
@@ -232,7 +230,7 @@ def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
                 where = f"{source}: {name}.{key}_kwargs"
                 raise ConfigError(f"{where}: no effect without {key}_class: {kind}")
         dropped = ALGORITHMS[algorithm].argument(recipe, "top_quantiles_to_drop_per_net")
-        there = policy.get("n_quantiles", _QUANTILES)
+        there = ALGORITHMS[algorithm].argument(recipe, "n_quantiles")
         if dropped is not None and dropped >= there:
             where = f"{source}: {name}.top_quantiles_to_drop_per_net"
             raise ConfigError(f"{where}: must be less than n_quantiles, {there}, not {dropped}")
