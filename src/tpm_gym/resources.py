@@ -1,6 +1,6 @@
 """Folders of the package's data: robot descriptions, recipes, trained policies.
 
-A wheel has them in ``tpm_gym/data``; a checkout in ``urdf`` and ``train``.
+In a wheel, they are in ``tpm_gym/data``. In a checkout, they are in ``urdf`` and ``train``.
 """
 
 from pathlib import Path

@@ -154,10 +154,11 @@ def _require_parts(mechanism: Mechanism) -> None:
 def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
     """Refuse wrong links, and names that are missing or repeated.
 
-    All links have a mass. All links but the first have a joint to a link that is listed before
-    them. Links have different names, and so have joints and closures. Closures, ``platform``
-    and ``tool`` refer to existing links, and ``actuated`` to existing joints. ``joints`` has a
-    position for each moving joint.
+    Each link must have a mass. The first link must have no joint; each other link must have a joint
+    to a link that is listed before it. The names of links must be different, and so must the names
+    of joints and the names of closures. Closures, ``platform`` and ``tool`` must refer to existing
+    links, and ``actuated`` to existing joints. ``joints`` must have a position for each moving
+    joint.
     """
     links, names = [link.name for link in mechanism.links], moving_joints(mechanism)
     held = [link.joint for link in mechanism.links[1:]]

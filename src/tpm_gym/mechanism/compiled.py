@@ -201,5 +201,5 @@ def _alike(values: ArrayLike, like: FloatArray) -> FloatArray:
 
 
 def _shaped(arrays: Iterable[Any], like: FloatArray) -> Iterator[Any]:
-    """Replace the first axis of each array by the axes of ``like`` without its last axis."""
+    """Replace the first axis of each array with the axes ``like.shape[:-1]``."""
     return (array.reshape(like.shape[:-1] + array.shape[1:]) for array in arrays)

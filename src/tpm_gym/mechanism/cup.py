@@ -28,10 +28,12 @@ class VacuumCup(NamedTuple):
         area: Area within the lip, on which the vacuum acts, m^2.
         evacuation_time: Time constant with which the vacuum builds up in a sealed cup, s, for an
             ejector of 5 l/min and a volume of 1.6 cm^3 in cup and hose.
-        venting_time: Time constant with which air enters through the valve or below the lip, s.
-        least_vacuum: Vacuum at which the lip comes off when the valve is closed, Pa.
-        friction: Friction of the open lip. Its product with the object's friction is the Coulomb
-            coefficient between them.
+        venting_time: Time constant with which air enters the cup, s, while the vacuum is off or the
+            lip is not sealed.
+        least_vacuum: Remaining vacuum at which the lip comes off after the vacuum is switched off,
+            Pa.
+        friction: Friction of the lip while it is not sealed. Its product with the object's friction
+            is the Coulomb coefficient between lip and object.
         seal_friction: Coulomb coefficient of the sealed lip, for clean silicone on a smooth
             surface. Makers of cups assume 0.5 for dry metal, glass or wood.
         seal_gap: Largest distance between lip and object at which the vacuum seals, m.

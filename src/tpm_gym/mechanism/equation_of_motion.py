@@ -26,7 +26,10 @@ _REST = (0.0, 0.0, 0.0)
 
 
 class Energy(NamedTuple):
-    """Kinetic energy, and potential energy up to a constant of the machine; (...,) J each."""
+    """Kinetic and potential energy in joules, (...,) each.
+
+    The potential energy has an arbitrary offset, which is the same for all states of a machine.
+    """
 
     kinetic: FloatArray
     potential: FloatArray
@@ -180,8 +183,8 @@ class EquationOfMotion(ABC):
     ) -> list[FloatArray]:
         """Call the function ``text`` for all rows of the states.
 
-        The arguments of ``text`` are the configuration at theta, and then all states but theta,
-        which is the first state.
+        The first of the states is theta. The arguments of ``text`` are the configuration at theta,
+        and then the other states in their order.
 
         Returns:
             Results of ``text`` for all rows.

@@ -6,7 +6,7 @@ A loop takes five arguments:
 * ``limit``: a distance, m, for the loops that compare positions.
 * ``built``: (b, k), the lengths (m) and the constants of the dynamics of b machines. Row i of the n
   rows belongs to machine ``built[i // (n // b)]``.
-* ``machine``: the signs of the modes, then gravity (3), m/s^2.
+* ``machine``: the signs of the modes, then the three components of gravity, m/s^2.
 * ``results``: a tuple of arrays with n rows, which the loop fills; NaN where there is no solution.
 
 A row does not depend on the others. So a call with one row and a call with thousands of rows give
@@ -153,7 +153,7 @@ def loops(name: str, few: int, many: int, equations: Equations) -> SimpleNamespa
     """Compile the loops of a mechanism; see :class:`tpm_gym.mechanism.compiled.CompiledMachine`.
 
     Args:
-        name: Name of the mechanism, for the machine code on disk.
+        name: Name of the mechanism. The compiled functions are kept on disk under this name.
         few: Number of lengths.
         many: Number of lengths and constants of the dynamics.
         equations: Functions of the mechanism.
@@ -162,7 +162,7 @@ def loops(name: str, few: int, many: int, equations: Equations) -> SimpleNamespa
     for size, rows in (few, _kinematics(equations)), (many, _dynamics(equations)):
         for row, width in rows.items():
             loop = _loop(row, equations.modes, size, width)
-            # Machine code on disk is found by this name: each mechanism needs its own.
+            # The compiled function is found on disk by this name: each mechanism needs its own.
             loop.__qualname__ = f"{name}.{row.__name__}"
             setattr(found, row.__name__, kept(loop))
     return found
@@ -242,7 +242,8 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
     def same_side(block: _Block, j: int) -> None:
         """Find whether P is on the assembly mode's side of the parallel singularities.
 
-        The result is true for points out of reach: these are beyond a serial singularity.
+        The result is true for points out of reach, too. They are beyond a serial singularity, which
+        limits the reach, and not beyond a parallel one.
         """
         g, point = lengths(block.own, j), get(block.given, 0, j)
         angles, real = posture(point, block.modes, g)
@@ -259,7 +260,10 @@ def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
     )
 
     def torque(block: _Block, j: int) -> None:
-        """Compute the motors' torques (3) N m for a motion (9) against a force on P (3) N."""
+        """Compute the motors' torques (3), N m, for a motion during which a force acts on P.
+
+        The inputs are theta, theta_dot, theta_ddot and the force, N, with three columns each.
+        """
         g, given = lengths(block.own, j), block.given
         at, there, _ = pose(get(given, 0, j), block.modes, g)
         rates, changes, bodies = get(given, 3, j), get(given, 6, j), inertia(block.own, j)

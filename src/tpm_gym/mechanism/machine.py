@@ -213,10 +213,11 @@ class Machine(ABC):
         """Find the mode that a machine has left, from its joint positions and the position of P.
 
         Returns:
-            (...,): 0, 1 or 2. 0: the machine left no mode. 1: it left the assembly mode, because it
-            passed a parallel singularity, so that the forward kinematics no longer give P. 2: it
-            left the working mode, because it passed a serial singularity, so that the inverse
-            kinematics no longer give its joint positions.
+            Code (...,): 0 if the machine left no mode, 1 if it left the assembly mode, 2 if it left
+            the working mode. A machine leaves the assembly mode when it passes a parallel
+            singularity; from then on, the forward kinematics do not give P. It leaves the working
+            mode when it passes a serial singularity; from then on, the inverse kinematics do not
+            give its joint positions.
         """
         del theta, built
         return np.zeros(np.shape(position)[:-1], dtype=np.int8)

@@ -19,7 +19,7 @@ SOLID = "solid"
 
 STIFF = "0.9999 0.9999 0.001 0.5 2"
 """Impedance (solimp) of rigid constraints: the largest that MuJoCo accepts. It does not depend on
-the size of the gap."""
+how far a constraint is violated."""
 
 # The file's time step (s), and its servos: N m/rad and N m s/rad.
 _TIME_STEP, _STIFFNESS, _DAMPING = 0.0005, 20000.0, 130.0
@@ -45,8 +45,9 @@ _NOTES = """
 def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
     """Build a root element with links, joints and closures, without motors or surroundings.
 
-    Bodies, joints and colours have the names of the mechanism's links, joints and colours. Closures
-    have the names of their joints. Geoms that collide have the name of their link.
+    Bodies, joints and colours have the names of the mechanism's links, joints and colours. The
+    equality constraint of a closure has the name of the closure. Geoms that collide have the name
+    of their link.
 
     Args:
         mechanism: Robot.

@@ -91,10 +91,11 @@ class Motor:
 
 
 TORQUE_MOTOR = Motor(
-    # Experts need at most 10 N m, and reversals at full speed 43 N m. So motors of half this
-    # strength still follow. The shear stress is 44 kPa (peak) and 18 kPa (continuous).
+    # Experts need at most 10 N m, and reversals at full speed need 43 N m. So motors with half this
+    # peak torque would still follow their references. The shear stress in the air gap is 44 kPa at
+    # the peak torque and 18 kPa at the continuous torque.
     peak_torque=100.0,
-    continuous_torque=40.0,  # loses 100 W: 0.17 m^2 of housing are 60 K warmer than the room
+    continuous_torque=40.0,  # 100 W of heat make the housing (0.17 m^2) 60 K warmer than the room
     motor_constant=4.0,
     no_load_speed=25.0,
     gap_radius=0.060,

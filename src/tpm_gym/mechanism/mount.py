@@ -54,9 +54,10 @@ class Mount:
 
     @cached_property
     def frame(self) -> tuple[FloatArray, FloatArray]:
-        """Factors (1 or -1) of the coordinates and origin (m) for the conversion, (3,) each.
+        """Factors (1 or -1) and origin (m) that convert points to the world frame, (3,) each.
 
-        World = factors * point + origin, and point = factors * (world - origin).
+        ``world = factors * point + origin``, and ``point = factors * (world - origin)``, where
+        ``point`` is in the paper frame.
         """
         return _HALF_TURN, np.array([0.0, 0.0, self.height])
 

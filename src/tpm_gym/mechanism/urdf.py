@@ -46,9 +46,9 @@ COLOURS = {
 _END: Final = 0.002
 """Length of each of the two end pieces of a cylinder, m; they are separate collision shapes.
 
-PyBullet finds one new contact of two shapes in a time step. If an upright cylinder hits a wall, the
-contact can be anywhere on its height. So a cup whose lip hits a block could get its contact far
-above the lip.
+PyBullet finds at most one new contact between two shapes in a time step. If an upright cylinder
+hits a wall, this contact can be anywhere on the cylinder's height. So without end pieces, a cup
+whose lip hits a block could get its contact far above the lip.
 """
 
 _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i, 3)}

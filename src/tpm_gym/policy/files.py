@@ -73,7 +73,7 @@ class Features(_Entries):
     """Input of the first layer.
 
     ``concatenate`` joins the entries of the observation in the order of ``keys``. ``goal_gap``
-    joins ``observation`` and the difference from achieved to desired goal, in units of ``unit`` m.
+    joins ``observation`` and ``(desired_goal - achieved_goal) / unit``, with ``unit`` in metres.
     """
 
     kind: Literal["concatenate", "goal_gap"]
@@ -182,7 +182,7 @@ def digest(content: Mapping[str, Any]) -> str:
 
 
 def read_description(path: str | Path) -> Description:
-    """Read the JSON file of a policy, named as for :func:`files`; refuse a damaged one."""
+    """Read the JSON file of a policy; refuse a damaged file. ``path`` is as in :func:`files`."""
     file, _ = files(path)
     data = _read(file, MAX_JSON)
     try:
@@ -199,7 +199,11 @@ def read_description(path: str | Path) -> Description:
 
 
 def read_weights(path: str | Path, description: Description) -> dict[str, NDArray[np.float32]]:
-    """Read finite weights by name, of the shapes in ``description.shapes``; refuse others."""
+    """Read the weights of a policy, by name. ``path`` is as in :func:`files`.
+
+    The file is refused if it is not the one that ``description`` names by its SHA-256, if the
+    shapes are not ``description.shapes``, or if a weight is not a finite float32.
+    """
     _, file = files(path)
     data = _read(file, description.weights.bytes)
     if hashlib.sha256(data).hexdigest() != description.weights.sha256:

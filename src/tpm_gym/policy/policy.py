@@ -35,8 +35,8 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises:
         InputError: ``path`` is empty, or is neither a str nor a Path.
-        PolicyFileError: A file is missing or is not that of a policy, or ``path`` is an archive of
-            Stable-Baselines3, which only unpickling could read.
+        PolicyFileError: A file is missing or does not belong to a policy, or ``path`` is an archive
+            of Stable-Baselines3, which only unpickling could read.
         MissingPackageError: safetensors or pydantic is not installed.
     """
     pair = files(path)
@@ -117,8 +117,8 @@ class Policy:
     def check(self, env: Any) -> None:
         """Check that the policy fits an environment.
 
-        The spaces are compared. For an environment of tpm_gym, the control is compared too, since
-        Cartesian increments and joint increments have equal spaces. The machine may differ.
+        The spaces are compared. For an environment of tpm_gym, the option ``control`` is compared
+        too, since Cartesian and joint increments have equal spaces. The machine may differ.
 
         Args:
             env: Environment of Gymnasium, wrapped or not, or vector environment of Gymnasium or of
@@ -183,7 +183,7 @@ def _rows(name: str, value: Any, shape: tuple[int, ...]) -> tuple[FloatArray, tu
 
 
 def _control(env: Any) -> str | None:
-    """Return the name of an environment's control; None if the environment is not of tpm_gym."""
+    """Return the option ``control`` of an environment; None for environments of other packages."""
     if hasattr(env, "has_attr") and env.has_attr("control"):  # of Stable-Baselines3
         return getattr(env.get_attr("control")[0], "name", None)
     own = getattr(env, "unwrapped", env)

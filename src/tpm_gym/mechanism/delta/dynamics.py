@@ -8,7 +8,7 @@ The model of the masses is exact for the bodies of :mod:`tpm_gym.mechanism.delta
 * a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points
   (:mod:`tpm_gym.mechanism.inertia`). It also turns about its own axis as it swings;
 * crosses swing with their rods;
-* platform, cup (its slide at rest) and payload translate as P does.
+* platform, cup and payload translate as P does. The cup's slide is assumed to be at rest.
 
 Forces of inertia and weight act at B_i and P. Three linear equations, with the rods as columns,
 give the forces in the rods. The forces in the rods give the torques.

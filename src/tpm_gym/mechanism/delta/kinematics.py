@@ -184,9 +184,10 @@ def no_assembly(
 
 
 def _regular(pose: Pose, regular: Numbers, ns: Namespace) -> Pose:
-    """Set det A to 1 where J does not exist.
+    """Set det A to 1 in the rows where J does not exist.
 
-    Otherwise, the derivatives of all rows with respect to the lengths would be NaN.
+    The lengths are shared by all rows. So without this change, one row without J would make the
+    derivatives with respect to the lengths NaN for all rows.
     """
     return pose._replace(parallel=ns.where(regular, pose.parallel, 1.0))
 

@@ -12,12 +12,13 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
 * the arms turn about the motors' axes;
 * a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points. Rods 4 and 11
   also turn about their own axes as they swing. The inertia of a swing includes this turning, and
-  the bodies that swing with the rods: end link 9 with rods 11, and with rods 4 the crosses (the
-  middle pieces of the universal joints at arm 2);
+  the bodies that swing with the rods. End link 9 swings with rods 11. The crosses (the middle
+  pieces of the universal joints at arm 2) swing with rods 4;
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z. It is a bar between C1 and P, except for constant offsets;
-* platform, cup (its slide at rest), payload and end link 10 translate as P does. End link 10 can
-  roll about its own axis, which does not change the motors' torques and is left out.
+* platform, cup, payload and end link 10 translate as P does. The cup's slide is assumed to be at
+  rest. End link 10 can also roll about its own axis. This roll does not change the motors' torques
+  and is left out.
 
 Units are SI. In the paper frame, gravity points along +z, as the base hangs upside down. Functions
 with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
@@ -225,11 +226,12 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
     """Solve B_iC_i . a_i = h_i for the motion of C1 and the rotation of link 7.
 
     If the results are velocities, a_i is the velocity of C_i. If the results are accelerations, a_i
-    is the acceleration of C_i, for C_3 without the centripetal part.
+    is the acceleration of C_i. But a_3 does not include the centripetal acceleration that the
+    rotation of link 7 causes.
 
     Returns:
-        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z. l7 times the angular
-        velocity (m/s) or angular acceleration (m/s^2) of link 7.
+        Velocity (m/s) or acceleration (m/s^2) of C1 along x and along z; then the angular velocity
+        or angular acceleration of link 7 times l7 (m/s or m/s^2).
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     x, z = (r2z * h1 - r1z * h2) * pose.per_planar, (r1x * h2 - r2x * h1) * pose.per_planar

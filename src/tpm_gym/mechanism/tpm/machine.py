@@ -83,7 +83,7 @@ class TPM(CompiledMachine):
 
     @cached_property
     def _constants(self) -> FloatArray:
-        """Signs of the assembly mode (2) and of the working mode (4), then gravity (3), m/s^2."""
+        """Two signs of the assembly mode, four of the working mode, then gravity (3,) m/s^2."""
         signs = *self.assembly_mode.signs, *self.working_mode.signs
         return np.array([*signs, *self.mount.free_fall])
 

@@ -109,8 +109,9 @@ class Contact:
 
         Returns:
             Force (r, last, 3) N of cup and objects on the platform in each time step, machine's
-            frame. It does not include weight and inertia of a cup that does not slide, because the
-            machine's dynamics include them. Mass (r,) kg of the held objects.
+            frame. It includes the inertia of the cup's motion relative to P. It does not include
+            the cup's weight, nor the inertia of a cup that moves as P does, because the machine's
+            dynamics include both. Mass (r,) kg of the held objects.
         """
         force, carried = np.zeros((len(rows), last, 3)), np.zeros(len(rows))
         if self._blocks:

@@ -109,7 +109,7 @@ class Tables(NamedTuple):
         objects: (n, k) records of :data:`OBJECT`.
         cups: (n,) records of :data:`CUP_STATE`.
         forces: (n, slots(k), 3) N, contact forces of the last time step.
-        awake: (n,) whether objects or cup may change although the lip is far from all objects.
+        awake: (n,) whether objects or cup may still change when the lip is far from all objects.
         belts: (n,) m/s, speeds of the belts along x.
     """
 
