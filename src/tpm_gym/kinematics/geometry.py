@@ -8,9 +8,10 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Limit, as a fraction of l1, below which a length counts as 0. If l1 - l3 (the smallest y_B1) is
-below the limit, and l5 or |l5 - l1| is below it too, the circles of Eq. (6) can nearly coincide.
-Their intersections would be inaccurate."""
+"""Limit for the lengths, as a fraction of l1. :class:`Geometry` refuses lengths for which l1 - l3
+(the smallest y_B1; may be negative) is below this limit, and l5 or |l5 - l1| is below it too. With
+such lengths, the two circles of Eq. (6) can nearly coincide, and their intersections would be
+inaccurate."""
 
 
 class Lengths(NamedTuple):
@@ -64,7 +65,7 @@ class Geometry:
         if self.l3 > l1 - close and min(l5, abs(l5 - l1)) < close:
             # Where a1 = b1 = 0 in Eq. (7), the two circles of Eq. (6) are concentric, and y_B1 is
             # 2 l5 or 2 (l1 - l5). If y_B1 is 0 too, the circles coincide, and link 3' can move
-            # with motors 1 and 2 held.
+            # with motors 1 and 2 locked.
             raise GeometryError(
                 "l5", l5, f"it must differ from 0 and from l1 = {l1} m by {close:.3g} m or more"
             )

@@ -44,7 +44,8 @@ class AssemblyMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16).
-            It gives the side of the line through both circles' centres (Eq. 6) on which C1 lies.
+            C1 is an intersection of the two circles of Eq. (6). The line through the circles'
+            centres has an intersection on each side; the sign selects the side.
         sin_beta: Sign of sin(beta), and so of y: the side of y = 0 on which the platform is.
     """
 
@@ -74,12 +75,13 @@ class RotatedMode(_Mode):
     """Branch of the forward kinematics in the second operation mode, one of 8.
 
     Attributes:
-        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`. It gives
-            the side on which rod 6 passes the point where rods 4a and 4b cross, as seen along y.
-            Exception: if rods 4a and 4b, seen along y, are shorter than links 3 and 3', more than
-            half of the assemblies of link 3' can have the same sign. Then they are sorted by the
-            planar factor times |B1C1|^2 (B1C1 as seen along y): ``planar`` is -1 in the lower half
-            and 1 in the upper half.
+        planar: Sign of the planar factor of :func:`tpm_gym.kinematics.rotated.factors`. The
+            sign gives the side on which rod 6 passes the point where rods 4a and 4b cross, as seen
+            along y. Exception: if rods 4a and 4b, seen along y, are shorter than links 3 and 3',
+            the planar factor can have the same sign in more than half of the assemblies of link 3'.
+            In this case, these assemblies are sorted by the planar factor times |B1C1|^2 (B1C1 as
+            seen along y): ``planar`` is -1 for the half of them with the smaller products, and 1
+            for the other half.
         further: Sign that selects one of the two assemblies of link 3' with the same ``planar``: -1
             for the smaller tilt phi in [0, 2 pi), 1 for the larger tilt.
         sin_beta: Sign of sin(beta), and so of y.
@@ -132,9 +134,10 @@ class ForwardSolutions:
 
     @property
     def free(self) -> BoolArray:
-        """(..., 4) bool, whether the loops close for every beta, because a2 = b2 = 0 in Eq. (10).
+        """(..., 4) bool, whether the loops of a branch close for every beta.
 
-        The platform can then move along a circle with all motors held, and no branch is valid.
+        They do where a2 = b2 = 0 in Eq. (10). There, the platform can move along a circle with all
+        motors locked, and the branch is not valid.
         """
         z = self.position[..., 2]
         found: BoolArray = (z == z) & ~self.valid
@@ -156,8 +159,9 @@ class InverseSolutions:
 
     Attributes:
         theta: (..., 16, 3) rad; NaN where the branch is not real. theta_1 and theta_3 are in
-            (-pi, pi], theta_2 is in [0, 2 pi). So each angle jumps where its arm points level
-            towards the centre. No posture of practical use is near a jump.
+            (-pi, pi], theta_2 is in [0, 2 pi). So an angle jumps by 2 pi where its arm lies in the
+            plane of the base and points towards the centre of the base. No posture of practical use
+            is near a jump.
         beta: (..., 16) rad, in (-pi, pi]; NaN where the branch is not real.
         valid: (..., 16) bool, whether the branch is real.
     """

@@ -33,8 +33,8 @@ class Namespace:
         arcsin: Arcsine of the clipped number.
         cos_third: Cosine of a third of the arccosine of the clipped number.
         positive: Angle in [0, 2 pi) from an angle in [-pi, pi].
-        signs: Array or tensor of the two numbers -1 and 1. The arguments are a number, whose type
-            and device a tensor gets, and the shape, such as (2, 1).
+        signs: Array or tensor with the two elements -1 and 1, from arguments (x, shape). Its shape
+            is ``shape``, such as (2, 1). A tensor has the type and the device of ``x``.
         stack: Components (...,) joined along a new last axis.
         join: Points (..., 3) broadcast with each other, and joined along their last axis.
         solve: Solutions of linear systems (..., k, k) for right sides (..., k).
@@ -139,7 +139,7 @@ def _torch() -> Namespace:
 def by_rows(
     text: Callable[[Any, Namespace], Sequence[Numbers]], points: FloatArray
 ) -> list[FloatArray]:
-    """Call the function ``text`` for points (..., k), in blocks of n points.
+    """Evaluate the equations in the function ``text`` for points (..., k), in blocks of n points.
 
     ``text`` takes two arguments: a tuple of the k components of a block's points, each an array
     (n,); and the namespace. Each result of ``text`` is a column (n,), a tuple of m columns, or a

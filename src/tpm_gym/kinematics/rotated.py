@@ -85,7 +85,7 @@ class RotatedPostures:
 
     @property
     def rods(self) -> FloatArray:
-        """Vectors along rods 4a, 4b and 6, and B3C3 (parallel to rods 11), (..., 4, 3) m."""
+        """Vectors along rods 4a, 4b and 6, and B3C3 (parallel to both rods 11), (..., 4, 3) m."""
         half = np.array([self.geometry.l5, 0.0, 0.0])
         b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
         feet: FloatArray = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
@@ -255,10 +255,11 @@ def _leg1(p: _Planar, link7: _Planar, g: Geometry) -> tuple[FloatArray, FloatArr
     """Solve for theta_1 and tilt, (..., 6) rad each.
 
     ``p`` is point P, and ``link7`` is the vector from C1 to P in the frame of link 3', both in m
-    and seen along y. The inner function ``terms`` computes ``up`` and ``out`` for a tilt phi: if
-    l3 sin(theta_1) is ``up``, B1C1 bisects the angle between links 3 and 3'; if l3 cos(theta_1) is
-    also ``out``, rods 4a and 4b have their length. So the equation up^2 + out^2 = l3^2 gives phi.
-    Multiplied by cos^2(phi / 2), this equation is a trigonometric polynomial of degree 3.
+    and seen along y. The inner function ``terms`` computes ``up`` and ``out`` for a tilt phi. If
+    l3 sin(theta_1) = up, then B1C1 bisects the angle between links 3 and 3'. If, in addition,
+    l3 cos(theta_1) = out, then rods 4a and 4b have the length l4. So the equation
+    up^2 + out^2 = l3^2 gives phi. Multiplied by cos^2(phi / 2), this equation is a trigonometric
+    polynomial of degree 3.
     """
     p, link7 = p[..., None], link7[..., None]
 
@@ -329,7 +330,7 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'; find if rod 11 fits."""
+    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'; find if rods 11 fit."""
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)
     u, w = to_c1.real + 2 * g.l2, to_c1.imag + g.l6
@@ -378,7 +379,7 @@ def velocity(postures: RotatedPostures) -> FloatArray:
     """Compute rates of P (m/rad) and the tilt (rad/rad) for unit rates of the motors, (..., 4, 3).
 
     The rates keep the lengths of all rods. Rods 4a, 4b and 6 give the velocity and the turn of link
-    3', and rod 11 gives the rate of link 7. At a parallel singularity, and where the two operation
+    3', and rods 11 give the rate of link 7. At a parallel singularity, and where the two operation
     modes meet, the rates are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends

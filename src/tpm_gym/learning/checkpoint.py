@@ -113,7 +113,10 @@ class CheckpointStore:
         return sorted(int(match[1]) for match in found if match and not match[2])
 
     def _tidy(self) -> None:
-        """Delete earlier checkpoints, and partial files that a killed process left."""
+        """Delete partial files of a killed process, and checkpoints that need not be kept.
+
+        The checkpoints of the steps in ``_whole`` are kept.
+        """
         kept = {self.path(step).name for step in self._whole}
         for entry in self.folder.iterdir():
             if _NAME.fullmatch(entry.name) and entry.name not in kept:

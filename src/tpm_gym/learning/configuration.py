@@ -60,7 +60,10 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_shield(words: Sequence[str]) -> bool | float:
-    """Parse the words after ``--shield``: True, False or a conditioning; no word means True."""
+    """Parse the words after ``--shield``: True, False or a conditioning.
+
+    If no word follows ``--shield``, return True.
+    """
     text = " ".join(words) or "True"
     return text == "True" if text in ("True", "False") else float(text)
 
@@ -169,8 +172,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the best policy's test, in that engine and in PyBullet, after a training in
-    --engine analytic; 0 for no test."""
+    """Episodes of the final test in each engine; 0 for no test. The test follows a training in
+    --engine analytic and runs the best policy in the analytic engine and in PyBullet."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so
@@ -241,8 +244,8 @@ class ResumeConfig:
     """Folder of the run."""
 
     env: Annotated[str, unset(str, "the run's", "MODULE:ID")] = UNSET
-    """Environment id of the run. It must be given if it is module:id, because importing a module
-    runs its code."""
+    """Environment id of the run. If the id is module:id, this option is required: importing a
+    module runs its code, so a module is imported only if you name it."""
 
     steps: Annotated[int, unset(int, "the run's", "INT")] = UNSET
     """Total number of steps, including the steps that are already taken."""

@@ -39,9 +39,14 @@ def import_module_of(env_id: str) -> None:
 
 
 def check_env_id(env_id: str) -> EnvSpec:
-    """Return the registration of an environment id; refuse ids of other packages.
+    """Return the registration of an environment id.
 
-    The module of ``module:id`` is not imported.
+    The module of ``module:id`` is not imported here; it must already be imported.
+
+    Raises:
+        ConfigError: The module is not imported, the id is not registered, its environment is not
+            derived from ``TPMEnv``, its vector environment is not derived from ``TPMVectorEnv``, or
+            its registration has no ``max_episode_steps``.
     """
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:

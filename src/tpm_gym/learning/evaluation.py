@@ -58,8 +58,9 @@ class EvaluationConfig:
     """expert, random, the id of a published policy, an exported policy or the folder of a run."""
 
     env: Annotated[str, unset(str, "the policy's; a module:id must be given", "ID")] = UNSET
-    """Environment id, or module:id if a module of yours registers it. It must be given if the
-    policy was trained in module:id, because importing a module runs its code."""
+    """Environment id, or module:id if a module of yours registers it. If the policy was
+    trained in module:id, this option is required: importing a module runs its code, so a module is
+    imported only if you name it."""
 
     episodes: int = 100
     """Episodes of each policy."""
@@ -162,7 +163,10 @@ def _check(config: EvaluationConfig) -> None:
 
 
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
-    """Take environment, machine, drive and shield from the policies if they are not given."""
+    """Complete the options.
+
+    If env, machine, drive or shield is not given, its value is taken from the policies.
+    """
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     if config.env is UNSET:
         if not trained:

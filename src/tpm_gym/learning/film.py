@@ -62,10 +62,10 @@ def contact_sheet(pictures: Mapping[str, Frame], columns: int) -> Image.Image:
 
 
 def _moments(frames: list[Frame]) -> list[int]:
-    """Return the indices of six frames that differ most.
+    """Return the indices of six frames that differ most from each other.
 
-    Choose the first and the last frame. Then repeatedly choose the frame that differs most from the
-    chosen frame to which it is most similar.
+    Choose the first and the last frame. Then compare each remaining frame with the chosen frame
+    most similar to it, and choose the frame with the largest difference. Repeat this step.
     """
     pictures = np.stack(frames)[:, ::2, ::2].astype(np.int16)
 

@@ -28,7 +28,11 @@ _ACTIONS: Final = 1  # not 0: NumPy pads seeds with zeros, so [seed, 0] equals s
 
 @dataclass(frozen=True)
 class TrainedPolicy:
-    """Policy of a trained algorithm: its mean action, or its actions as in training."""
+    """Policy of a trained algorithm.
+
+    If ``deterministic`` is True, the policy returns its mean action. Otherwise, it samples the
+    action, as in training. An exported policy has to be deterministic.
+    """
 
     model: BaseAlgorithm | ExportedPolicy
     deterministic: bool = True

@@ -59,9 +59,10 @@ class Recipe:
         """Return keyword arguments for the algorithm's constructor, with classes, not their names.
 
         Args:
-            update: Steps between two updates, as a fraction of all steps. In the last update, a
-                falling learning rate is ``update`` times its first value. With ``update=0``, as in
-                Stable-Baselines3, this rate is zero, and the last update changes nothing.
+            update: Steps between two updates, as a fraction of all steps. If the learning
+                rate falls, its last value is its first value multiplied by this fraction. With
+                ``update=0``, as in Stable-Baselines3, the last value is zero, so the last update
+                changes nothing.
         """
         entries = self.entries()
         for name in ("n_timesteps", "n_envs", "demonstrations"):
@@ -113,8 +114,9 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
     """Return the alphabetically first algorithm with a recipe for an id.
 
-    If there is none, return the first algorithm with a recipe of pick-and-place that the id can use
-    (see :func:`read_recipe`), or else ``"sac"``.
+    If no algorithm has a recipe for the id, return the first algorithm whose recipe of
+    pick-and-place the id can use (see :func:`read_recipe`). Without such an algorithm,
+    return ``"sac"``.
 
     Args:
         env_id: ``id`` or ``module:id``.

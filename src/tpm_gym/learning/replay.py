@@ -1,8 +1,9 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
 The algorithm is the one that ``tpm-gym train`` uses without ``--algo``. The policy acts as in
-training, with its exploration. Episodes are spread evenly over the training, or over the steps that
-follow its demonstrations. The episodes have seeds of their own and do not affect the training.
+training, with its exploration. Episodes are spread evenly over the training; if the training
+begins with demonstrations, over the steps after them. The episodes have seeds of their own and do
+not affect the training.
 """
 
 from collections.abc import Callable, Iterator

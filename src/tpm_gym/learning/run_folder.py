@@ -1,6 +1,7 @@
 """Folder of a run: names of its files, and rules for writing and deleting them.
 
-Only files that a run writes are deleted, by name. A policy is deleted only if the user asks for it.
+Only files that a run writes are deleted. Policies are deleted only by ``--overwrite``, and by
+resuming from a checkpoint that does not contain them.
 """
 
 import json

@@ -192,7 +192,10 @@ def _say(console: Console, text: str) -> None:
 
 @dataclass(frozen=True)
 class _Session:
-    """Part of a run that this process executes, from the start or the checkpoint ``content``."""
+    """Part of a run that is executed by this process.
+
+    It begins at the checkpoint ``content``, or at the start of the run if ``content`` is None.
+    """
 
     config: TrainingConfig
     console: Console
@@ -362,8 +365,7 @@ def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
 def _require_room(config: TrainingConfig, numbers: int) -> None:
     """Refuse a buffer that does not fit in memory.
 
-    Each stored step is assumed to take two observations. ``numbers`` is the number of values in an
-    observation.
+    The buffer is assumed to store two observations of ``numbers`` values for each step.
     """
     name = "buffer_size" if config.argument("buffer_size") else "n_steps"
     size = config.argument("buffer_size") or config.rollout

@@ -98,7 +98,10 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
         return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": self._actions}
 
     def replay(self, episode: Mapping[str, Any]) -> Observation | None:
-        """Repeat an episode; return its last observation, or None if it raises a TPMError."""
+        """Repeat an episode; return its last observation.
+
+        Return None if the reset or a step raises a TPMError.
+        """
         self.unwrapped.np_random.bit_generator.state = episode["rng"]
         try:
             observation, _ = self.reset(seed=episode["seed"])

@@ -129,7 +129,8 @@ class Joint:
             joints.
         upper: Upper limit, rad or m.
         effort: Limit of torque or force, N m or N; zero for passive joints.
-        speed: Speed at which no effort is left, rad/s or m/s; zero for passive joints.
+        speed: Lowest speed at which the limit of the effort is zero, rad/s or m/s; zero for passive
+            joints.
         corner: Highest speed with full effort, rad/s or m/s. From ``corner`` to ``speed``, the
             limit of the effort falls linearly to zero.
         rpy: Roll, pitch and yaw of the joint's frame in the parent's frame, rad, as in URDF.
@@ -231,7 +232,7 @@ class Mechanism:
         tool: Name of the link that slides in the platform, with the vacuum cup.
         lip: Centre of the cup's lip in the tool's frame, m.
         actuated: Names of the motors' joints, in the order of theta_1, theta_2, theta_3.
-        name: Name in files.
+        name: Name of the robot in its URDF and MJCF files; the files' names begin with this name.
     """
 
     links: tuple[Link, ...]
