@@ -324,7 +324,7 @@ def _compared(runs: Frame) -> list[str]:
     shares = shares.unstack().reindex(columns=[0.0, 1.0]).dropna()
     return [
         f"{env}, {label}: {without:.2%} without the penalty, {with_it:.3%} with it: "
-        + (f"{without / with_it:,.0f} times less." if with_it > 0 else "never below.")
+        + (f"{without / with_it:,.0f} times less." if with_it > 0 else "no step below safe.")
         for (env, label), without, with_it in shares.itertuples()
     ]
 
