@@ -27,12 +27,13 @@ def test_a_full_action_moves_p_at_the_same_speed(engine):
             env.reset(seed=0)
             start = env.state.command
             for _ in range(steps):
-                env.step(np.array([1.0, 0.0, 0.0]))
+                observation, *_ = env.step(np.array([1.0, 0.0, 0.0]))
             travelled[task] = env.state.command - start
             assert env.metadata["render_fps"] == round(1 / task.control_period)
             # Once the spline is straight, P moves at full speed, in m/s.
             speed = PAPER_TPM.step_limit[0] / 0.04
             assert env.state.fk_velocity[0] == pytest.approx(speed, rel=5e-3)
+            assert observation["observation"][3] == pytest.approx(1.0, rel=5e-3)
     np.testing.assert_allclose(travelled[Quick], travelled[Reach], rtol=0, atol=1e-12)
 
 

@@ -6,8 +6,8 @@ import pytest
 from episodes import expert_episode
 from machines import each_machine
 
-from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
-from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
+from tpm_gym.errors import ResetOptionError, UnreachableError
+from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.tasks import Conveyor
 from tpm_gym.tasks.conveyor import SPEEDS
 
@@ -47,8 +47,6 @@ def test_tempting_ways_are_only_just_safe():
         assert info["is_success"]
         least = min(info["conditioning"] for _, _, info in steps)
         assert 0.95 < least / PAPER_TPM.safe_conditioning < 1.4
-    with pytest.raises(ConfigurationError, match="no such way"):  # all its table is safe
-        Conveyor(WIDE_TPM, goals="tempting").start([np.random.default_rng(0)])
 
 
 def test_the_camera_shows_the_block_as_many_steps_late_as_stated():

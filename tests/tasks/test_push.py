@@ -4,8 +4,12 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from episodes import expert_episode
+from scipy.spatial.transform import Rotation
+from states import random_state
 
+from tpm_gym import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
+from tpm_gym.tasks.push import Push
 
 START = {"object": (0.0, -0.03, 0.02), "goal": (0.1, -0.033, 0.02)}
 
@@ -40,3 +44,10 @@ def test_the_expert_topples_no_block():
     env = gym.make("TPMPush-v0", engine="analytic")
     for seed in range(20):
         assert not any(info["toppled"] for *_, info in expert_episode(env, seed))
+
+
+def test_the_yaw_of_the_block_is_observed_up_to_quarter_turns():
+    task, state = Push(PAPER_TPM), random_state(np.random.default_rng(0), (50,))
+    yaw = Rotation.from_quat(state.object_quaternion[:, 0]).as_euler("ZYX")[:, 0]
+    found = task.decode(task.observe(state))["object_turn"]
+    np.testing.assert_allclose(found.T, (np.cos(4 * yaw), np.sin(4 * yaw)), atol=1e-9)

@@ -97,7 +97,7 @@ def test_goals_out_of_throwing_range_are_refused_with_the_range(machine):
     low, high = task.reach_of(Throw.block)
     assert start[0] == pytest.approx(low[0] - 0.04)
     assert stop[0] == pytest.approx(high[0] + 0.04)
-    wrong = [start[0] + 0.001, stop[0] - 0.001, left[0] - 0.001, right[0] + 0.001, inside[0]]
+    wrong = [start[0] + 1e-5, stop[0] - 1e-5, left[0] - 1e-5, right[0] + 1e-5, inside[0]]
     for place in (*((x, y, level) for x in wrong), (stop[0], 0.7, level), (stop[0], y, 0.03)):
         with pytest.raises(UnreachableError, match=r"goal must lie in .* or in") as caught:
             task.start(rng, {"goal": place})
@@ -122,7 +122,7 @@ def test_a_machine_throws_only_where_its_table_goes_on():
     assert (goals[:, 0] < task.reach_of(Throw.block)[0][0]).all()
 
 
-@pytest.mark.parametrize("place", [-0.38, -0.1, 0.26])
+@pytest.mark.parametrize("place", [-0.409, -0.1, 0.289])  # within the tolerance of goals
 def test_a_block_on_its_way_to_a_goal_is_not_lost_and_costs_no_way_to_the_cup(place):
     task = Throw(PAPER_TPM, "dense")
     at = np.array([[[place, -0.03, 0.015]]])
