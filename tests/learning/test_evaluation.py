@@ -72,8 +72,10 @@ def test_one_policy_has_its_metrics_at_the_top_and_its_records(written):
 
 
 def test_table_shows_means_and_intervals(written):
-    _, output = written
-    for shown in ("success at end", "expert", "[51.0, 100.0]"):  # Wilson interval of 4 of 4
+    content, output = written
+    errors = [f"{1e3 * content['closure_error_max'][part]:.4f} mm" for part in ("mean", "worst")]
+    # The Wilson interval of 4 of 4.
+    for shown in ("success at end", "expert", "[51.0, 100.0]", "seeds 7 to 10", *errors):
         assert shown in output
 
 
@@ -217,7 +219,7 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     nominal = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
     assert content["env_options"] == nominal
     path = tmp_path / "other.json"
-    words = ["--policy", "random", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
+    words = ["--policy", "expert", "--env", "TPMReach-v0", "--episodes", "1", "--json", str(path)]
     words += ["--randomisation", "encoder_noise=1e-4", "friction=0.5:1", "latency=1"]
     words += ["--penalty-weight", "0.5", "--goals", "tempting", "--drive", "servo"]
     monkeypatch.setattr(sys, "argv", ["tpm-gym", "evaluate", *words])
@@ -225,6 +227,7 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     content = read_strict(path)
     assert content["randomisation"] == {"encoder_noise": 1e-4, "friction": [0.5, 1.0], "latency": 1}
     assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
+    assert content["conditioning_min"]["mean"] < 0.09  # of sampled goals, seldom
     assert content["env_options"] == {**nominal, "drive": "servo"}
     assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
 

@@ -137,10 +137,12 @@ def test_values_that_are_not_finite_raise(name, value):
 def test_batches_give_the_records_of_single_environments(spec):
     """More episodes than environments; returns only to the rounding of the network's batches."""
     options = {"engine": "analytic", "randomisation": {"latency": 1}}
-    records = []
+    records, ended = [], []
     for count in (1, 3):
         with closing(make_envs(PICK, count, **options)) as envs:
-            records.append(run_episodes(envs, load_policy(spec, envs), 5, TEST_SEED))
+            policy = load_policy(spec, envs)
+            records.append(run_episodes(envs, policy, 5, TEST_SEED, on_episodes=ended.append))
+    assert ended == [*[1] * 5, 3, 2]
     for one, other in zip(*records, strict=True):
         rounded = {name: 0.0 for name, value in vars(one).items() if isinstance(value, float)}
         assert replace(one, **rounded) == replace(other, **rounded)
@@ -178,6 +180,8 @@ def test_summary_keeps_the_worst_of_all_episodes():
     assert metrics["conditioning_mean"].mean == pytest.approx((3 * 0.4 + 0.3) / 4)
     assert metrics["return"].mean == pytest.approx(-1.25)
     assert metrics["torque_peak"].worst == 2.0
+    assert metrics["torque_rms"].worst == pytest.approx(math.sqrt(3))
+    assert metrics["fk_error_max"].worst == pytest.approx(2 * 9e-5)
     assert metrics["success_at_end"].worst is None
 
 

@@ -30,14 +30,32 @@ def test_the_expert_brings_the_block_to_its_place_in_the_tray(engine, machine, e
 
 @pytest.mark.parametrize("speed", [SPEEDS[0], SPEEDS[1], 0.0])
 def test_the_expert_picks_at_any_speed_of_the_belt(speed):
-    env = gym.make("TPMConveyor-v0", engine="analytic")
-    options = {"belt_speed": speed, "object": (-0.19, -0.03, 0.015)}
-    *_, (_, _, info) = expert_episode(env, 0, STEPS, options)
-    assert env.unwrapped.state.belt_speed == speed
-    assert info["is_success"]
-    # A block on a belt that stands is drawn at the edge of the reach.
-    *_, (_, _, info) = expert_episode(env, 0, STEPS, {"belt_speed": speed})
-    assert info["is_success"]
+    env, grip = gym.make("TPMConveyor-v0", engine="analytic"), np.full(3, np.nan)
+    end = env.unwrapped.task.belt.end  # beyond it, blocks stand still
+    for x in (-0.19, end, None):
+        # Without a place, a block on a belt that stands is drawn at the edge of the reach.
+        options = {"belt_speed": speed} | ({} if x is None else {"object": (x, -0.03, 0.015)})
+        for last in expert_episode(env, 0, STEPS, options):
+            (observation, _, info), state = last, env.unwrapped.state
+            if state.held == 0:
+                grip = state.platform_position - state.object_position[0]
+        assert state.belt_speed == speed
+        assert info["is_success"]
+        np.testing.assert_allclose(grip[:2], 0.0, atol=1e-3)
+        gap = observation["achieved_goal"] - observation["desired_goal"]
+        np.testing.assert_allclose(gap, 0.0, atol=1e-4)
+        assert state.platform_position[2] - grip[2] > 0.04  # the cup has left the block
+
+
+def test_blocks_come_within_reach_in_the_first_second_and_goals_are_in_the_tray():
+    task = Conveyor(PAPER_TPM)
+    starts = task.start([np.random.default_rng(seed) for seed in range(200)])
+    wait = (task.reach_of(task.block)[0][0] - starts["object"][:, 0]) / starts["belt_speed"][:, 0]
+    assert 0.6 < wait.max() < 1.0
+    boxes = {"object": task.starts_of(task.block), "goal": task.goals_of(task.block)[0]}
+    for name, (low, high) in boxes.items():
+        place = starts[name]
+        assert ((place >= low - 1e-9) & (place <= high + 1e-9)).all()
 
 
 def test_tempting_ways_are_only_just_safe():
@@ -77,7 +95,13 @@ def test_impossible_options_of_the_belt_are_refused():
     for speed in (1.5, np.nan, [0.1, 0.1], "fast", [[0.1], [0.1, 0.2]]):
         with pytest.raises(ResetOptionError, match="belt_speed"):
             task.start(rngs, {"belt_speed": speed})
-    with pytest.raises(UnreachableError):  # the place is in the tray
-        task.start(rngs, {"object": (0.05, -0.03, 0.015)})
-    with pytest.raises(UnreachableError):  # the goal is on the belt
-        task.start(rngs, {"goal": (-0.1, -0.03, 0.015)})
+    start, end = task.belt.start, task.belt.end
+    for name, x, z in (
+        ("object", start + 0.02, 0.015),
+        ("object", -0.19, 0.1),  # above the belt
+        ("object", end + 0.01, 0.015),  # in the tray
+        ("goal", end + 0.02, 0.015),  # beside the belt
+        ("goal", end + 0.1, 0.1),
+    ):
+        with pytest.raises(UnreachableError, match=name):
+            task.start(rngs, {name: (x, -0.03, z)})

@@ -178,13 +178,29 @@ def test_commands_ask_no_more_than_the_motors_have(seed):
     for step in range(200):
         if step % 5 == 0:
             wish = rng.choice([-0.02, 0.0, 0.02], (50, 3)) * (1.0, 0.025, 1.0)
-        then = follower.limit(np.clip(current + wish, low, high), current, before)
+        wanted = np.clip(current + wish, low, high)
+        enough = np.abs(follower._torques(before, current, wanted[None])[0]) <= EFFORT
+        assert (follower.feasible(before, current, wanted) == enough.all(axis=1)).all()
+        then = follower.limit(wanted, current, before)
         assert ((then >= low) & (then <= high)).all()
         kept.append(np.abs(then - 2 * current + before) <= change * (1 + 1e-6))
         there.append(np.abs(follower._torques(before, current, then[None])) <= EFFORT)
         before, current = current, then
     assert np.mean(kept) > 0.99
     assert np.mean(there) > 0.99
+
+
+def test_commands_brake_as_stated_and_stop_at_the_ends_of_the_region():
+    task = loaded(0.1)
+    region, home = task.machine.region, np.array(task.machine.home)
+    follower = Follower(task.machine, *task.accelerations, task.control_period)
+    ends = np.concatenate([np.where(np.eye(3), end, home) for end in (region.low, region.high)])
+    rows = [np.tile(home, (6, 1))] * 2
+    for _ in range(300):
+        rows.append(follower.limit(ends, rows[-1], rows[-2]))
+    assert_allclose(rows[-1], ends, atol=1e-12)
+    changes = np.diff(rows, 2, axis=0) * np.sign(ends - home) / task.control_period**2
+    assert (changes > -1.2 * np.array(task.accelerations[1])).all()
 
 
 def test_a_mechanism_without_the_payload_is_refused():

@@ -14,7 +14,16 @@ from tpm_gym.errors import ConfigurationError, InputError, ResetOptionError, Unr
 from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
 from tpm_gym.simulation.state import Block, Scene, State
-from tpm_gym.tasks import Entry, PickAndPlace, Reach, Task
+from tpm_gym.tasks import (
+    Conveyor,
+    Entry,
+    PickAndPlace,
+    Push,
+    Reach,
+    Stack,
+    Task,
+    Throw,
+)
 from tpm_gym.tasks.registry import make_task
 
 BLOCK = PickAndPlace.block
@@ -111,6 +120,22 @@ def test_the_reward_has_the_documented_terms():
         gap, penalty = task.gap(np.zeros((1, 3)), goal), task.penalty(state)
         found = {name: v.item() for name, v in task.reward_terms(state, gap, penalty).items()}
         assert found == pytest.approx(names)
+
+
+@pytest.mark.parametrize(
+    ("kind", "place"),
+    [
+        (Conveyor, lambda task, state: task.top(state)),
+        (Push, lambda task, state: state.object_position[:, 0]),
+        (Stack, lambda task, state: task.top(state, 1)),
+        (Throw, lambda task, state: task.top(state)),
+    ],
+)
+def test_half_the_way_from_the_cup_to_the_block_costs(kind, place):
+    task = kind(PAPER_TPM, "dense")
+    state = states(task, object_position=np.full((len(task.scene.objects), 3), -0.1))
+    way = np.linalg.norm(task.lip(state) - place(task, state), axis=1)
+    assert task.shaping(state) == {"approach": pytest.approx(-0.5 * way / 0.1)}
 
 
 @pytest.mark.parametrize("mode", ["assembly", "working"])
