@@ -55,7 +55,7 @@ def test_episodes_lead_from_one_end_to_the_other(machine):
         goals, starts = part.core.goals, part.core.simulation.state().platform_position
         assert_allclose(np.abs(goals - starts), np.tile((STROKE, 0.0, 0.0), (40, 1)), atol=1e-9)
         assert 10 < (goals[:, 0] > starts[:, 0]).sum() < 30
-        points = machine.mount.to_paper(goals)
+        points = machine.mount.to_paper(np.concatenate([starts, goals]))
         assert (machine.conditioning_at(points) >= machine.safe_conditioning).all()
 
 
@@ -96,6 +96,7 @@ def test_a_film_shows_the_payload_and_the_gate():
 @pytest.mark.parametrize("payload", LOADS)
 def test_the_timing_uses_what_the_motors_have_and_no_more(payload):
     task = loaded(payload)
+    assert task.machine.payload == payload
     path, most = task.gate(0.03), USABLE * EFFORT
     times, torques = timed(task.machine, path, CONTINUOUS * EFFORT, most)
     spans = np.diff(times)
@@ -162,6 +163,11 @@ def test_below_the_gate_costs():
         point = path[60] + (0.0, 0.0, depth)
         state.fk_position = task.machine.mount.to_world(point)[None]
         assert task.shaping(state)["gate"][0] == pytest.approx(-cost, abs=1e-3)
+
+
+def test_a_dense_reward_is_steeper_near_the_goal():
+    for reward, expected in (("sparse", (0.0, -1.0)), ("dense", (-0.01 - 0.1, -1.0 - 1.0))):
+        assert_allclose(Cycle(PAPER_TPM, reward).goal_term(np.array([0.001, 0.1])), expected)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,7 +9,9 @@ from states import random_state
 
 from tpm_gym import PAPER_TPM
 from tpm_gym.mechanism.cup import CUP
-from tpm_gym.tasks.push import Push
+from tpm_gym.tasks.motion import hanging
+from tpm_gym.tasks.push import CLEARANCE, Push
+from tpm_gym.tasks.sampling import BAND
 
 START = {"object": (0.0, -0.03, 0.02), "goal": (0.1, -0.033, 0.02)}
 
@@ -40,10 +42,27 @@ def test_a_block_that_is_struck_high_topples_and_info_says_so(engine):
         assert (upright[-1] < 0.1) == falls
 
 
-def test_the_expert_topples_no_block():
-    env = gym.make("TPMPush-v0", engine="analytic")
-    for seed in range(20):
-        assert not any(info["toppled"] for *_, info in expert_episode(env, seed))
+@pytest.mark.parametrize("goals", ["sampled", "tempting"])
+def test_blocks_are_to_be_pushed_where_the_robot_is_safe(goals):
+    task, machine = Push(PAPER_TPM, goals=goals), PAPER_TPM
+    drawn = task.start([np.random.default_rng(seed) for seed in range(300)])
+    ends = np.stack([drawn["object"], drawn["goal"]], axis=1)
+    along = np.abs(np.diff(ends, axis=1)[:, 0, :2]).max(axis=1)
+    assert 0.06 <= along.min() <= along.max() <= 0.24
+    behind = machine.mount.to_paper(task.behind(ends, np.diff(ends, axis=1), CLEARANCE))
+    assert (machine.conditioning_at(behind) >= machine.safe_conditioning).all()
+    held = machine.conditioning_at(machine.mount.to_paper(ends + hanging(task.block)))
+    assert (held.max() < machine.safe_conditioning + BAND) == (goals == "tempting")
+
+
+@pytest.mark.parametrize("goals", ["sampled", "tempting"])
+def test_the_expert_topples_no_block_and_stays_almost_safe(goals):
+    env = gym.make("TPMPush-v0", engine="analytic", goals=goals)
+    for seed in range(12):
+        infos = [info for *_, info in expert_episode(env, seed)]
+        assert not any(info["toppled"] for info in infos)
+        least = min(info["conditioning"] for info in infos)
+        assert least > 0.9 * PAPER_TPM.safe_conditioning
 
 
 def test_the_yaw_of_the_block_is_observed_up_to_quarter_turns():

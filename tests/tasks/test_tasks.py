@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -373,3 +374,9 @@ def test_blocks_of_a_stack_start_beside_each_other(machine):
     starts = task.start([np.random.default_rng(seed) for seed in range(3000)])
     gap = np.abs(starts["lower"] - starts["upper"])[:, :2].max(axis=1)
     assert (gap > task.scene.objects[0].width).all()
+    for one, other in combinations((starts["lower"], starts["upper"], starts["goal"][:, :3]), 2):
+        assert np.linalg.norm(one - other, axis=1).min() > 0.045 - 1e-9
+
+
+def test_the_block_of_a_stack_that_is_farther_from_its_goal_decides():
+    assert Stack(PAPER_TPM).gap(np.zeros(6), [0.03, 0, 0, 0, 0.04, 0]) == pytest.approx(0.04)

@@ -119,8 +119,8 @@ class Cycle(Task):
     def _height(self, way: FloatArray) -> FloatArray:
         """Return the height of the gate, m, at distances ``way`` (...,) m from an end along x."""
         to_end = np.minimum(way, STROKE - way)
-        share = np.clip(1 - to_end / BLEND, 0.0, 1.0)
-        height: FloatArray = np.where(to_end < 0, 0.0, RISE * np.cbrt(1 - share**3))
+        share = np.clip(1 - to_end / BLEND, 0.0, 1.0)  # 1 beyond the ends, where the height is 0
+        height: FloatArray = RISE * np.cbrt(1 - share**3)
         return height
 
     def gate(self, y: float, backwards: bool = False) -> FloatArray:
