@@ -14,7 +14,9 @@ from tpm_gym.learning import (
     Demonstrations,
     GoalGapExtractor,
     PenaltyHerReplayBuffer,
+    demonstrations,
 )
+from tpm_gym.learning.cloning import clone
 from tpm_gym.learning.demonstrations import _returns, _Step
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import ConfigError
@@ -75,6 +77,7 @@ def test_every_second_episode_is_disturbed_and_the_vacuum_never():
     assert np.array_equal(before[:HORIZON], after[:HORIZON])
     assert not np.array_equal(before[HORIZON:], after[HORIZON:])
     assert set(after[:, 3]) == {-1.0, 1.0}
+    assert np.abs(after).max() == 1.0  # noise leads to no action outside of the space
 
 
 def test_an_episode_that_ends_early_is_followed_by_another_and_all_are_whole():
@@ -98,15 +101,21 @@ def test_an_episode_that_ends_early_is_followed_by_another_and_all_are_whole():
     assert set(ends[ends[:, 0] == HORIZON - 1][:, 1]) == set(range(count))
     assert (buffer.ep_length[:HORIZON] > 0).all()  # every step is of an episode with an end
     assert buffer.timeouts[:HORIZON].sum() == len(ends)
+    assert 0.1 < callback.successes < 0.9
 
 
-def test_episodes_are_as_long_as_those_of_the_training():
-    venv = make_vec_env("TPMReach-v0", n_envs=1, env_kwargs={"max_episode_steps": 20})
-    model = PPO("MultiInputPolicy", venv, n_steps=10, batch_size=10)
-    model._setup_learn(1, callback := Demonstrations(episodes=2, epochs=1))
-    callback.init_callback(model)
-    callback.on_training_start({}, {})
-    assert model.num_timesteps == 2 * 20
+def test_episodes_are_as_long_as_those_of_the_training_and_imitated_without_their_noise(
+    monkeypatch,
+):
+    wanted: list[Any] = []
+    monkeypatch.setattr(demonstrations, "clone", lambda *parts: wanted.append(parts[2]))
+    venv = make_vec_env("TPMReach-v0", n_envs=2, env_kwargs={"max_episode_steps": 20})
+    for noise in (0.0, 0.5):
+        model = PPO("MultiInputPolicy", venv, n_steps=10, batch_size=10, seed=0)
+        model._setup_learn(1, callback := Demonstrations(episodes=2, noise=noise))
+        callback.on_training_start({}, {})
+        assert model.num_timesteps == 2 * 20
+    np.testing.assert_array_equal(*(actions[:2] for actions in wanted))
 
 
 def test_they_are_not_played_again_when_a_run_goes_on():
@@ -130,6 +139,16 @@ def test_without_a_replay_buffer_the_networks_imitate_them():
     assert summarise(episodes)["success_at_end"].mean > 0.9
     test.close()
     venv.close()
+
+
+def test_the_value_function_is_fitted_to_the_returns():
+    model = PPO("MultiInputPolicy", make_vec_env("TPMReach-v0"), seed=0, device="cpu")
+    rng, spaces = np.random.default_rng(0), model.observation_space
+    seen = {name: rng.normal(size=(10_000, *box.shape)) for name, box in spaces.items()}
+    returns = 3.0 * seen["observation"][:, 0] - 20.0
+    clone(model, seen, np.zeros((10_000, 3)), returns, epochs=1)
+    values = model.policy.predict_values(model.policy.obs_to_tensor(seen)[0])[:, 0].detach()
+    assert np.mean((values.numpy() - returns) ** 2) < 0.1 * np.var(returns)
 
 
 def test_networks_that_see_normalised_observations_are_refused():

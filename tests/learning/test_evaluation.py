@@ -113,13 +113,12 @@ def short() -> Iterator[str]:
 
 # imageio-ffmpeg leaves a pipe to the collector where ffmpeg ends before its reader is closed.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_video_shows_the_first_episodes(short, tmp_path):
+@pytest.mark.parametrize(("episodes", "shown"), [(2, 1), (1, 3)])
+def test_video_shows_the_first_episodes(episodes, shown, short, tmp_path):
     path = tmp_path / "films" / "expert.mp4"
-    config = EvaluationConfig(
-        policy=("expert",), env=short, episodes=2, video=path, video_episodes=1
-    )
+    asked = {"policy": ("expert",), "env": short, "episodes": episodes, "video_episodes": shown}
     console = quiet()
-    (result,) = evaluate(config, console)
+    (result,) = evaluate(EvaluationConfig(**asked, video=path), console)
     frames = imageio.imread(path, plugin="FFMPEG")  # (frames, height, width, 3)
     assert len(frames) == result.records[0].length + 1
     assert frames[0].std() > 5  # something is to be seen
@@ -230,6 +229,13 @@ def test_conditions_are_recorded_and_the_defaults_are_the_nominal_machine(
     assert content["conditioning_min"]["mean"] < 0.09  # of sampled goals, seldom
     assert content["env_options"] == {**nominal, "drive": "servo"}
     assert "--randomisation encoder_noise=1e-4 friction=0.5:1" in content["command"]
+
+
+def test_an_option_of_the_id_is_recorded(short, tmp_path):
+    path = tmp_path / "out.json"
+    gym.spec(short).kwargs["machine"] = "wide"
+    evaluate(EvaluationConfig(("random",), env=short, episodes=1, json=path), quiet())
+    assert read_strict(path)["env_options"]["machine"] == "wide"
 
 
 @pytest.fixture(scope="module")

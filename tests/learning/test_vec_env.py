@@ -1,11 +1,14 @@
 """Environments of the analytic engine behind Stable-Baselines3, and policies evaluated in them."""
 
+import copy
+import json
 from contextlib import closing
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from episodes import EVERYTHING, bits
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 
 import tpm_gym
@@ -24,17 +27,21 @@ def test_it_is_sb3s_own_vector_of_single_environments():
     theirs = DummyVecEnv([lambda: gym.make(PICK, engine="analytic", max_episode_steps=6)] * 3)
     ours = vec_env(max_episode_steps=6)
     for envs in (ours, theirs):
+        envs.reset()
+        envs.step(np.zeros((3, 4), np.float32))  # of an episode that the next reset ends
         envs.seed(4)
     one, other = ours.reset(), theirs.reset()
-    rng = np.random.default_rng(0)
+    rng, rewards = np.random.default_rng(0), []
     for _ in range(15):
         for name in one:
             np.testing.assert_array_equal(one[name], other[name])
         actions = rng.uniform(-1.0, 1.0, (3, 4)).astype(np.float32)
         (one, *got), (other, *wanted) = ours.step(actions), theirs.step(actions)
+        rewards.append(got[0])
         for values, expected in zip(got[:2], wanted[:2], strict=True):
             np.testing.assert_array_equal(values, expected)
-        for info, expected in zip(got[2], wanted[2], strict=True):
+        sums = np.sum(rewards[-6:], axis=0).tolist()
+        for info, expected, total in zip(got[2], wanted[2], sums, strict=True):
             last = info.get("terminal_observation")
             if last is None:
                 assert "terminal_observation" not in expected
@@ -43,7 +50,7 @@ def test_it_is_sb3s_own_vector_of_single_environments():
                 np.testing.assert_array_equal(last[name], values)
             for name in ("TimeLimit.truncated", "is_success"):
                 assert info[name] == expected[name]
-            assert info["episode"]["l"] == 6
+            assert info["episode"] == {"r": pytest.approx(total), "l": 6}
 
 
 def test_options_are_of_their_environments_and_of_the_next_reset_only():
@@ -58,6 +65,19 @@ def test_options_are_of_their_environments_and_of_the_next_reset_only():
         for one, other in zip(*found, strict=True):
             for name in one:
                 np.testing.assert_array_equal(one[name], other[name])
+
+
+def test_robots_that_differ_go_on_equally_from_what_is_saved():
+    one, other = (vec_env(max_episode_steps=12, randomisation=EVERYTHING) for _ in range(2))
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 3, 4)).astype(np.float32)
+    for envs in (one, other):
+        envs.reset()
+    for action in actions[:7]:
+        one.step(action)
+    plain, arrays = copy.deepcopy(one.state())
+    other.restore(json.loads(json.dumps(plain)), arrays)
+    found = [bits([envs.step(action) for action in actions[7:]]) for envs in (one, other)]
+    assert found[0] == found[1]
 
 
 def test_another_autoreset_is_refused():
