@@ -97,12 +97,12 @@ def event(name, happens):
     return {"events": (name,), name: lambda self, state: happens(state)}
 
 
-def an_entry(scale, source):
+def an_entry(scale, source, columns=None):
     """Return observed() with a further entry."""
 
     def observed(self):
         centre = (0.0,) * len(scale)
-        return (*self.robot_entries(), Entry("extra", "m", "-", centre, scale, source))
+        return (*self.robot_entries(), Entry("extra", "m", "-", centre, scale, source, columns))
 
     return {"observed": observed}
 
@@ -125,6 +125,7 @@ def an_entry(scale, source):
         ({"observed": tpm_gym.tasks.Task.robot_entries}, r"observed\(\) = .*'red_held'.*add obj"),
         (an_entry((1.0,), lambda state: state.fk_position), r"'extra' = .*\(n, 1\)"),
         (an_entry((1.0,), lambda state: state.torque[:, 0]), r"'extra' = .*\(n, 1\)"),
+        (an_entry((1.0,) * 2, lambda state: state.torque, (2, 4)), r"'extra' = .*\(n, 2\)"),
         (an_entry((0.0,) * 3, lambda state: state.torque), "'extra', scale = .*other"),
         (an_entry((np.nan,) * 3, lambda state: state.torque), "'extra', scale = .*fin"),
         *(({"events": (name,)}, f"'{name}' .*methods") for name in ("absent", "tolerance")),

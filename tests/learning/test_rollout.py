@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import PolicyError, RolloutError
 from tpm_gym.learning.estimates import bootstrap, wilson
-from tpm_gym.learning.policies import NoisyPolicy, load_policy
+from tpm_gym.learning.policies import NoisyPolicy, TrainedPolicy, load_policy
 from tpm_gym.learning.rollout import TEST_SEED, Episode, run_episodes, summarise
 
 PICK = "TPMPickAndPlace-v0"
@@ -199,10 +199,17 @@ def test_actions_do_not_depend_on_the_goal(name):
     count = 1000
     with closing(make_envs("TPMReach-v0", count, engine="analytic")) as envs:
         still = Mock(act=lambda observation: np.zeros((count, 3)))
-        policy = load_policy("random", envs) if name == "random" else NoisyPolicy(still, 0.3)
+        policy = load_policy("random", envs) if name == "random" else NoisyPolicy(still, 0.4)
         observation, _ = envs.reset(seed=0)
         policy.reset(observation, range(count))
         actions = np.hstack([policy.act(observation) for _ in range(3)])
+    assert actions.std() == pytest.approx(0.4 if name == "noisy" else 3**-0.5, rel=0.05)
+    assert 0.99 < np.abs(actions).max() <= 1.0
     for sizes in (actions, np.abs(actions)):
         joined = np.hstack([observation["desired_goal"], sizes])
         assert np.abs(np.corrcoef(joined.T)[:3, 3:]).max() < 0.15
+
+
+def test_a_trained_policy_draws_actions_only_if_asked_to():
+    model = Mock(predict=lambda seen, deterministic: (deterministic, None))
+    assert [TrainedPolicy(model, mean).act({}) for mean in (True, False)] == [True, False]

@@ -24,7 +24,8 @@ def run(tmp_path):
     (folder / "tests").mkdir()
     (folder / "tests" / "nominal.json").write_text('{"env": 1, "episodes": 1, "command": ""}')
     (folder / "config.json").write_text(json.dumps(OURS))
-    for name in ("best.zip", "last.safetensors", "progress.csv", "events.out.tfevents.1.host"):
+    files = ("best.zip", "last.safetensors", "progress.csv", "learning_curve.png")
+    for name in (*files, "events.out.tfevents.1.host"):
         (folder / name).write_text("")
     return folder
 
@@ -40,6 +41,11 @@ def test_a_run_is_replaced_only_if_asked_to(run):
     assert names(run) == before
     prepare(run, overwrite=True)
     assert names(run) == []
+
+
+def test_the_partial_file_of_a_killed_process_does_not_occupy_a_folder(tmp_path):
+    (tmp_path / ".config.json").write_text("{")
+    prepare(tmp_path, overwrite=False)
 
 
 @pytest.mark.parametrize("config", [None, '{"model_type": "bert"}', "{", "[]", '"text"'])

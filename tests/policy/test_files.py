@@ -100,6 +100,7 @@ def put(path: Sequence[Any], value: Any) -> dict[str, Any]:
         ("network.features.kind", "eval"),
         ("network.features.unit", 0),
         ("network.features", {"kind": "concatenate", "keys": ["observation"]}),
+        ("network.features.keys", ["observation", "observation", "achieved_goal", "desired_goal"]),
         ("network.hidden", [0] * 100_000),
         ("network.activation", "exec"),
         ("env_options", {"eval": "x"}),
@@ -121,6 +122,13 @@ def test_entries_that_cannot_be_are_refused(tmp_path, path, value):
     assert caught.value.path.startswith(str(tmp_path / "p"))
     assert str(caught.value).isprintable()
     assert len(caught.value.reason) < 1000
+
+
+def test_a_gap_is_between_two_goals(tmp_path):
+    content = put(["observation_space"], {"observation": box(4, 10.0)})
+    content["network"]["features"]["keys"] = ["observation"]
+    with pytest.raises(PolicyFileError, match="needs an observation and two goals"):
+        load_policy(write(tmp_path, content))
 
 
 def test_no_entry_may_be_missing(tmp_path):

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import gantry  # noqa: F401  registers a machine
@@ -126,6 +127,19 @@ def test_its_commands_start_and_stop_gently_and_respect_the_step_limit():
         assert (np.abs(steps) <= np.array(machine.step_limit) * (1 + 1e-9)).all()
         assert shares[0] == pytest.approx(shares.min())
         assert shares[0] <= 0.5 * shares.max() + 1e-12
+
+
+def test_a_moving_target_is_met_within_the_step_limit():
+    env = gym.make("TPMReach-v0", engine="analytic")
+    machine, motion = env.unwrapped.machine, Motion(env.unwrapped.machine, env.unwrapped.control)
+    motion.seen = env.unwrapped.task.decode(env.reset(seed=0)[0]["observation"])
+    start, step, up = motion.command, np.array([0.012, 0.0, 0.0]), np.array([0.0, 0.0, -0.03])
+    target = start + (0.1, 0.0, 0.05) + np.arange(40)[:, None] * step
+    moves = list(motion.meet(partial(next, iter([target[0], *target])), step, up))
+    points = np.array([start, *(move.point for move in moves)])
+    assert (np.abs(np.diff(points, axis=0)) <= np.array(machine.step_limit) * (1 + 1e-9)).all()
+    np.testing.assert_allclose(points[-1], target[len(moves) - 1], atol=1e-12)
+    assert [move.vacuum for move in (moves[0], moves[-1])] == [False, True]
 
 
 # -- when it cannot --------------------------------------------------------------------------------

@@ -283,6 +283,7 @@ def test_a_sample_that_ignores_what_is_chosen_is_refused():
     [
         ("achieved", lambda task, state: state.fk_position[:, :2], "achieved()"),
         ("achieved", lambda task, state: state.fk_position - state.torque.mean(0), "achieved()"),
+        ("achieved", lambda task, state: state.fk_position - state.torque[0], "achieved()"),
         ("observe", lambda task, state: Task.observe(task, state)[::-1], "observe()"),
         ("gap", lambda task, one, other: np.linalg.norm(np.subtract(one, other)), "gap()"),
         ("shaping", lambda task, state: {"goal": state.held * 0.0}, "shaping()"),
