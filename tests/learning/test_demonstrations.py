@@ -61,15 +61,6 @@ def test_the_buffer_holds_what_the_environment_would_do_again():
     env.close()
 
 
-def test_episodes_end_by_time_and_not_by_failure():
-    model, _ = filled(episodes=2, noise=0.0)
-    buffer = model.replay_buffer
-    assert buffer.dones[: 2 * HORIZON, 0].reshape(2, HORIZON)[:, -1].all()
-    assert buffer.dones[: 2 * HORIZON].sum() == 2
-    # An end by time is no end of the return, so the samples say "not done".
-    assert not buffer.sample(64).dones.any()
-
-
 def test_every_second_episode_is_disturbed_and_the_vacuum_never():
     calm, _ = filled(episodes=2, noise=0.0)
     noisy, _ = filled(episodes=2, noise=0.3)
@@ -116,13 +107,6 @@ def test_episodes_are_as_long_as_those_of_the_training_and_imitated_without_thei
         callback.on_training_start({}, {})
         assert model.num_timesteps == 2 * 20
     np.testing.assert_array_equal(*(actions[:2] for actions in wanted))
-
-
-def test_they_are_not_played_again_when_a_run_goes_on():
-    model, callback = filled(episodes=2, noise=0.0)
-    model.learn(1, callback=callback, reset_num_timesteps=False)
-    assert model.replay_buffer is not None
-    assert model.replay_buffer.size() == 2 * HORIZON + 1
 
 
 def test_without_a_replay_buffer_the_networks_imitate_them():

@@ -103,15 +103,6 @@ def test_cartesian_actions_are_fractions_of_the_step_limit(machine, action, shar
 
 
 @each_machine
-def test_small_joint_actions_turn_the_joints_by_just_that(machine):
-    rng, control = np.random.default_rng(0), One(JointControl(machine))
-    for share in rng.uniform(0.2, 0.8, (100, 3)):
-        current, action = within(machine, share), rng.uniform(-0.01, 0.01, 3)
-        found = turn(machine, current, control.command(action, current))
-        np.testing.assert_allclose(found, action * machine.joint_limit, rtol=0, atol=1e-9)
-
-
-@each_machine
 def test_joint_actions_at_full_scale_are_slowed_down_to_the_limit(machine):
     rng = np.random.default_rng(1)
     region = machine.region
@@ -129,6 +120,7 @@ def test_joint_actions_at_full_scale_are_slowed_down_to_the_limit(machine):
     inside = (commands - region.low > 1e-6) & (np.array(region.high) - commands > 1e-6)
     free = inside.all(axis=1)  # of the region's faces
     assert (far & free).sum() > 300
+    assert (~far & free).sum() > 20
     slowed = way[far & free]
     assert slowed.min() > 0.995
     np.testing.assert_allclose(commands[~far & free], full[~far & free], rtol=0, atol=1e-12)

@@ -4,28 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from episodes import expert_episode
-from machines import each_machine
 
 from tpm_gym.errors import ResetOptionError, UnreachableError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.tasks import Conveyor
 from tpm_gym.tasks.conveyor import SPEEDS
 
-each_engine = pytest.mark.parametrize("engine", ["pybullet", "mujoco", "analytic"])
 STEPS = Conveyor.max_episode_steps
-
-
-@each_engine
-@each_machine
-@pytest.mark.parametrize("episodes", [2, pytest.param(100, marks=pytest.mark.slow)])
-def test_the_expert_brings_the_block_to_its_place_in_the_tray(engine, machine, episodes):
-    env = gym.make("TPMConveyor-v0", engine=engine, machine=machine)
-    for seed in range(episodes):
-        *_, (_, _, info) = expert_episode(env, seed, STEPS)
-        state = env.unwrapped.state
-        assert info["is_success"]
-        assert state.held == -1
-        assert state.object_position[0, 0] > env.unwrapped.task.belt.end
 
 
 @pytest.mark.parametrize("speed", [SPEEDS[0], SPEEDS[1], 0.0])
