@@ -331,10 +331,10 @@ class Simulation:
     def _mirrored(
         self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the mirror plane, seen from home.
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots whose P is not on home's side of the plane.
 
-        The plane is normal to ``mirror_axis``. A position of P and its mirror image have the same
-        joint positions, so encoders do not show on which side of the plane P is. The sign of a
+        The mirror plane is normal to ``mirror_axis``. A position of P and its mirror image have the
+        same joint positions, so encoders do not show on which side of the plane P is. The sign of a
         passive joint's position shows the side. A switch would measure this sign on a real robot.
 
         P may turn back at the plane although its commands lead through the plane. Then the path

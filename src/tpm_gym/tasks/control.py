@@ -97,8 +97,8 @@ class JointControl:
 
     An action of 1 moves a joint by the machine's ``joint_limit``, scaled to the control period. The
     increment is scaled down as a whole if it would move P farther than the step limit, or into a
-    posture that cannot be assembled. (This is frequent along y, where small turns of the joints
-    move the platform far.) A command beyond the region is projected into it.
+    posture that cannot be assembled. (Many increments exceed the step limit along y, because small
+    turns of the joints move P far along y.) A command beyond the region is projected into it.
     """
 
     name = "joints"
@@ -146,10 +146,11 @@ class JointControl:
     ) -> FloatArray:
         """Shorten the increment so that P moves by almost the step limit; return P (r, 3) m.
 
-        ``excess`` is the displacement at ``share``. The secant through two tries gives the next
-        try. (Dividing ``share`` by the displacement alone converges slowly next to the serial
-        singularity, where the displacement is not proportional to the share.) Next to a parallel
-        singularity, it can happen that all tries exceed the limit; P then stays where it is.
+        ``excess`` is P's displacement at ``share``, in units of the step limit. The secant through
+        two tries gives the next try. (If every try only divided ``share`` by ``excess``, the search
+        would converge slowly next to the serial singularity, where the displacement is not
+        proportional to the share.) Next to a parallel singularity, it can happen that all tries
+        exceed the limit; P then stays where it is.
         """
         point, low, high = current, np.zeros_like(share), share
         before, was = np.zeros_like(share), np.zeros_like(share)

@@ -29,7 +29,7 @@ SHARE: Final = 0.55
 EDGE: Final = 0.030
 """Smallest distance of goals from the end of the belt, m."""
 CLEARANCE: Final = 0.028
-"""Height over start and goal from which the cup comes down, and to which it goes up again, m."""
+"""Height over start and goal, m: the cup comes down from this height, and goes up to it again."""
 UP: Final = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
 SEALING: Final = 4
 """Largest number of control steps for which the cup follows the block until the cup seals."""

@@ -23,7 +23,7 @@ __all__ = ["Cycle"]
 
 STROKE: Final = 0.305
 RISE: Final = 0.025
-"""Size of the way of P, m: STROKE along x; RISE up at one end and down at the other end."""
+"""Size of P's way, m: P moves up by RISE at one end, by STROKE along x, and down by RISE."""
 BLEND: Final = 0.050
 """Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
 
@@ -34,7 +34,7 @@ SPEED: Final = 5.0
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
-"""Largest RMS torque of the plan, as a share of the peak torque; 2% are a reserve for servos."""
+"""Largest RMS torque of the plan / peak torque; 2% of the continuous torque is kept for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
 """Acceleration limits (x, y, z), as shares of P's largest acceleration along that axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
@@ -46,7 +46,7 @@ to brake along x and z at the same time.
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth, m, at which the reward term is -1: depth of P below the gate minus the tolerance."""
+"""Depth, m: the reward term is -1 if P is below the gate by the tolerance plus this depth."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""

@@ -149,8 +149,8 @@ class Motion:
     def _overlapped(self, ways: list[FloatArray]) -> FloatArray:
         """Return the fractions (n, k) of k ways that P has covered after each of n control steps.
 
-        P follows the ways one after the other. Each way begins while the way before it slows down.
-        The sum of the speeds of these two ways does not exceed the largest speed of one way.
+        P follows the ways one after the other. Each way begins while P slows down on the previous
+        way. The sum of the speeds of these two ways does not exceed the largest speed of one way.
 
         Args:
             ways: For each way, the covered fractions by :meth:`trapezoid`.

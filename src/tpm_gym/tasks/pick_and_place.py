@@ -17,7 +17,7 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.028
-"""Height over start and goal from which the cup comes down, and to which it goes up again, m.
+"""Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 
 The height is no multiple of the tolerance, so that rounding errors do not decide about success.
 """

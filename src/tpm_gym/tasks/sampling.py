@@ -41,9 +41,10 @@ __all__ = [
 APART: Final = 0.030
 """Smallest distance from start to goal, m, so that no episode starts with success."""
 BAND: Final = 0.004
-"""Largest difference between the conditioning of a tempting start or goal and the threshold.
+"""Largest amount by which the conditioning of a tempting start or goal exceeds the threshold.
 
-On the paper's machine, a displacement of about 1 mm along y changes the conditioning by as much.
+On the paper's machine, a displacement of about 1 mm along y changes the conditioning by this
+amount.
 """
 
 _DRAWS: Final = 4  # points in a call; nearly every row then needs only one call

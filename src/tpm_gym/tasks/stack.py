@@ -17,7 +17,7 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["Stack"]
 
 CLEARANCE: Final = 0.045
-"""Height over start and goal from which the cup comes down, and to which it goes up again, m.
+"""Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 
 At this height, a carried block passes above a standing block.
 """

@@ -87,8 +87,8 @@ class Task(ABC):
         control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
             scaled to this time. For a shorter time, set :attr:`accelerations`: without it, the
             commands can need more torque than the motors have, and shields cannot be used.
-        accelerations: Limits of the command's acceleration, and of its deceleration before the
-            ends of the region, along x, y, z, machine's frame, m/s^2; None for no limits.
+        accelerations: Limits along x, y, z of the machine's frame, m/s^2: largest acceleration of
+            the command, and its deceleration before an end of the region; None for no limits.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         camera_delay: Control steps by which observation and achieved goal show objects late.
         entries: Entries of the observation vector, in order.
@@ -479,7 +479,7 @@ class Task(ABC):
         return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
-        """Return the region's centre and half size, m, world; limits of speed, m/s, and step, m."""
+        """Return the region's centre and half size, m, world; speed limits, m/s; step limits, m."""
         region, mount = self.machine.region, self.machine.mount
         step = np.multiply(self.machine.step_limit, self.control_period / CONTROL_PERIOD)
         low, high = np.array(region.low), np.array(region.high)

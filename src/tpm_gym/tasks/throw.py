@@ -121,7 +121,7 @@ class Throw(Task):
         """Return the place (..., 3) m of the release, and the run-up's last step along x (...,) m.
 
         When the block hits the table after a fall by h, friction (coefficient mu) reduces its speed
-        v by mu sqrt(2 g h). Fall and slide together cover v^2 / (2 mu g) + mu h along x.
+        v by mu sqrt(2 g h). The fall and the slide together cover v^2 / (2 mu g) + mu h along x.
         """
         low, high = self.reach_of(self.block)
         side = np.where(goal[..., 0] > (low[0] + high[0]) / 2, 1.0, -1.0)

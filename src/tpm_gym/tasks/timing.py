@@ -143,7 +143,7 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Find the smallest factor for the times with which every motor keeps its limits.
+    """Find the smallest factor for which no motor exceeds its limits.
 
     All times are multiplied by this factor. The search is a bisection.
     """

@@ -81,8 +81,9 @@ def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> Fl
 def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
     """Return the points P (m, a, b, 3) of the surface on which a factor is zero.
 
-    The factor depends on point C1 alone, and is zero on curves of C1. For each C1 on these curves,
-    link 7 turns P through a half circle. Points of other working modes are NaN.
+    The factor depends on the position of C1 alone, and is zero where C1 is on certain curves. For
+    each position of C1 on these curves, link 7 can turn P along a half circle. Points of other
+    working modes are NaN.
     """
     x, z, p, q = (part[..., None] for part in sheets.curves(factor, mode, g))
     beta = np.linspace(-np.pi / 2, np.pi / 2, _AROUND)
