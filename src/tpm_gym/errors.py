@@ -21,9 +21,10 @@ def brief(value: Any) -> Any:
 
 
 class TPMError(Exception):
-    """Root of all errors raised by tpm_gym. They survive pickling, as between worker processes.
+    """Base class of all errors raised by tpm_gym.
 
-    Errors with values are dataclasses; :attr:`template` formats the values as a message.
+    The errors can be pickled, for example to pass them between processes. Errors with values are
+    dataclasses; :attr:`template` formats the values as a message.
     """
 
     template: ClassVar[str] = ""

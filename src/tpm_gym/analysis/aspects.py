@@ -3,9 +3,9 @@
 The platform can move between two points of one aspect without a singularity (Wenger and Chablat).
 Between two aspects of one working mode, every path passes a singularity. Sets are grids of cells in
 the paper frame, in metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only
-curved surfaces run through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Other
-limits, such as the stops of the motors, count only if they are given
-(:mod:`tpm_gym.analysis.limits`).
+curved surfaces run through cells. All factors of :mod:`tpm_gym.analysis.singularity` are taken
+into account. Other limits, such as the stops of the motors, are taken into account only if they are
+given (:mod:`tpm_gym.analysis.limits`).
 """
 
 import math
@@ -130,7 +130,7 @@ def aspects(
     Two cells belong to one aspect if they share a face and all factors have the same signs at their
     centres. So a neck narrower than a cell divides an aspect, and a singular wall thinner than a
     cell may be missed: compare two grids. Points that ``limits`` forbid divide aspects too. Regions
-    of fewer than ``min_cells`` cells, fragments along curved boundaries, are left out.
+    of fewer than ``min_cells`` cells are left out: they are fragments along curved boundaries.
 
     Raises:
         ConfigurationError: The shape is not possible, or min_cells is not positive.
@@ -147,13 +147,17 @@ def aspects(
 def regions(
     low: Vector, spacing: Vector, codes: IntArray, min_cells: int
 ) -> Iterator[tuple[int, Cells]]:
-    """Yield code and cells of the connected regions of equal code, the largest first.
+    """Find the connected regions of cells with equal codes, and yield the largest region first.
 
     Args:
         low: Corner of the grid with the smallest x, y, z, m.
         spacing: Edges of a cell, m.
-        codes: (nx, ny, nz); negative for cells of no region.
+        codes: (nx, ny, nz) code of each cell, such as the signs of its factors as bits; negative
+            for cells that belong to no region.
         min_cells: Fewest cells of a region.
+
+    Yields:
+        The code and the cells of a region.
 
     Raises:
         ConfigurationError: min_cells is no positive whole number.

@@ -202,8 +202,9 @@ class Core:
             The randomisation of each episode; empty dictionaries without randomisation.
 
         Raises:
-            ResetOptionError: If an option is not possible; nothing has happened then.
-            UnreachableError: If an object or the goal is out of reach; nothing has happened then.
+            ResetOptionError: If an option is not possible; the environments are then unchanged.
+            UnreachableError: If an object or the goal is out of reach; the environments are then
+                unchanged.
         """
         self.require_open()
         before = [rng.bit_generator.state for rng in rngs] if options is not None else []
@@ -238,7 +239,8 @@ class Core:
 
         Args:
             actions: (n, action_size) finite numbers; clipped to [-1, 1].
-            running: (r,) environments whose encoders are read with noise.
+            running: (r,) environments whose episode is running. Encoder noise is drawn only for
+                these environments.
         """
         actions = np.minimum(np.maximum(actions, -1.0), 1.0)
         late = self._pending
@@ -377,8 +379,8 @@ class Core:
 
         Raises:
             EpisodeError: If the environments are closed.
-            InputError: If ``snapshot`` is no snapshot of equal environments; nothing has happened
-                then.
+            InputError: If ``snapshot`` is no snapshot of equal environments; the environments are
+                then unchanged.
         """
         self.require_open()
         self.require_equal(snapshot)

@@ -23,7 +23,7 @@ RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple", "segmentation
 
 
 class Rendering:
-    """Options of frames: mode, camera and size; see :class:`tpm_gym.TPMEnv`.
+    """Options of frames: render mode, camera and size; see :class:`tpm_gym.TPMEnv`.
 
     Raises:
         ConfigurationError: If an option is out of range.
@@ -43,10 +43,10 @@ class Rendering:
         self.view = View(camera, int(width), int(height), segmented)
 
     def frame(self, simulation: Simulation, row: int, markers: ArrayLike) -> Any:
-        """Draw a frame of the mode; ``markers`` (k, 3) m are the goal markers.
+        """Draw the environment ``row`` in the render mode; ``markers`` (k, 3) m mark its goals.
 
         Raises:
-            ConfigurationError: If the engine cannot draw frames of the mode.
+            ConfigurationError: If the engine cannot draw in the render mode.
         """
         if self.mode == "rgb_array":
             return simulation.picture(self.view, markers, row).colour

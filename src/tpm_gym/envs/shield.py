@@ -1,8 +1,8 @@
 """Shield: the nearest command that keeps the machine away from singularities.
 
-Let c be the last command, d the next one, and m the middle of the last two commands. In a control
-period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If the
-command then stays at d, P moves on to d in a straight line. The command d is safe if the
+Let c be the last command, m the middle between c and the command before c, and d the next command.
+In a control period, point P follows the Bezier curve with the control points m, c and (c + d) / 2.
+If the command then stays at d, P moves on to d in a straight line. The command d is safe if the
 conditioning 1/cond(J) stays at ``least`` or above on curve and line. So it is always safe to hold
 the last command c: P then moves on the line from m to c, and the check of c included this line.
 
@@ -65,7 +65,7 @@ def _nodes() -> FloatArray:
 
 
 class Problem(NamedTuple):
-    """Search for the nearest safe commands of r robots.
+    """Data of a search for the nearest safe commands of r robots.
 
     Attributes:
         wanted: (r, 3) wanted commands, in units of the action.
@@ -210,8 +210,9 @@ class BrakingShield:
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
         """Return safe commands (n, 3) m between the braking commands and the wanted ones.
 
-        If even braking leads to a conditioning below ``least``, the returned command is no worse:
-        the smallest conditioning on its path is at least that on the path of braking.
+        If even braking leads to a conditioning below ``least``, the returned command is no worse
+        than braking: the conditioning on its path is never below the smallest conditioning on the
+        path of braking.
 
         Args:
             wanted: (n, 3) m, commands by control and follower, machine's frame.

@@ -62,9 +62,10 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Frames
 
-    World: z up, table top at z = 0, x and y as seen from above. The base hangs upside down, so
-    world = (x, -y, height - z) of the paper's frame; the workspace is a slab of negative world y.
-    Point P is the middle of the platform; the vacuum cup ends 40 mm below it.
+    The world frame is right-handed, with z up and the table top at z = 0. The base hangs upside
+    down at z = height: a point (x, y, z) of the paper's frame is (x, -y, height - z) in the world.
+    The workspace is a slab of negative world y. Point P is the middle of the platform; the vacuum
+    cup ends 40 mm below it.
 
     ## Action
 
@@ -73,14 +74,15 @@ class TPMEnv(gym.Env[Observation, Action]):
     | entries | meaning |
     | --- | --- |
     | 0 to 2, Cartesian | increment of the command for P, paper's x, y, z: at most 30, 5, 30 mm |
-    | 0 to 2, joints | increment of theta_1 to theta_3: at most 0.08 rad, P at most as above |
+    | 0 to 2, joints | increments of theta_1 to theta_3: at most 0.08 rad each |
     | 3, with vacuum | above 0: vacuum on |
 
     Commands accumulate and are projected into the task region; P follows them along a B-spline. The
-    region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
-    turns of the joints move P far along y. Therefore the limit for P scales most random joint
-    actions down to a tenth, with one factor for all three joints. Cycle has control steps of 4 ms,
-    smaller increments and bounded accelerations.
+    region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Joint
+    increments move P no farther along each axis than Cartesian increments. Small turns of the
+    joints move P far along y. Therefore this limit scales most random joint actions down to a
+    tenth, with one factor for all three joints. Cycle has control steps of 4 ms, smaller increments
+    and bounded accelerations.
 
     ## Observation
 
@@ -128,8 +130,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Start
 
     The arm is at rest at home (Cycle: at one end). Blocks (square, 36 mm wide, 30 mm high, 50 g)
-    are flat on the table or the belt. Goals and objects are sampled at least 30 mm
-    away from each other (Reach: from P), where 1/cond(J) >= 0.08.
+    are flat on the table or the belt. Goals and objects are sampled where 1/cond(J) >= 0.08, and
+    at least 30 mm away from each other. In Reach, the goal is at least 30 mm away from P.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` sets both; a block that starts above
     the table falls.
 
@@ -140,7 +142,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``is_success`` | whether the goal is achieved |
     | ``closure_error`` | largest gap of the simulated loops, m; always 0 in the analytic engine |
     | ``vacuum`` | pressure in the cup below the ambient pressure, Pa |
-    | ``conditioning`` | 1/cond(J) by the encoders |
+    | ``conditioning`` | 1/cond(J), computed from the encoders |
     | ``singularity_penalty`` | penalty before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
     | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
@@ -170,8 +172,8 @@ class TPMEnv(gym.Env[Observation, Action]):
             name that :func:`tpm_gym.register_engine` has registered. The analytic engine draws with
             PyBullet, or with MuJoCo where PyBullet is not installed.
         machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
-            has registered, or a :class:`~tpm_gym.Machine`; a spec that is written as JSON needs a
-            name.
+            has registered, or a :class:`~tpm_gym.Machine`. To write the
+            environment's spec as JSON, give a name.
         goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
             a singularity. This is possible only if the machine's region for goals has such places.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
@@ -296,8 +298,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             ResetOptionError: If an option is unknown, has the wrong shape, is not finite, or would
-                put an object into another or into the robot; nothing has happened then.
-            UnreachableError: If an object or the goal is out of reach; nothing has happened then.
+                put an object into another or into the robot; the environment is then unchanged.
+            UnreachableError: If an object or the goal is out of reach; the environment is then
+                unchanged.
             EpisodeError: If the environment is closed.
             ConfigurationError: If a method of the task returns a wrong shape, type or value.
         """
@@ -319,7 +322,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         """Run one control step.
 
         Raises:
-            ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
+            ActionError: If the action has the wrong shape or is not finite; the environment is then
+                unchanged.
             EpisodeError: If there is no episode: before reset, after close or after a ClosureError.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
@@ -432,8 +436,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If ``snapshot`` is no snapshot of an equal environment; nothing has
-                happened then.
+            InputError: If ``snapshot`` is no snapshot of an equal environment; the environment is
+                then unchanged.
         """
         observation = self._core.restore(snapshot)
         (rng,) = self._core.rngs

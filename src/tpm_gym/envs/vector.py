@@ -58,8 +58,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             stepped one after another.
         num_threads: Threads that step the environments of the analytic engine.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
-        autoreset_mode: When environments whose episode ended are reset: ``NEXT_STEP``,
-            ``SAME_STEP`` (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (by
+        autoreset_mode: Time of the reset after the end of an episode: ``NEXT_STEP``, ``SAME_STEP``
+            (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (the user calls
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a full reset have different lengths, so that
             they do not all end at the same step. This makes on-policy batches more even.
@@ -174,8 +174,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
                 for all environments.
 
         Raises:
-            InputError: If a seed is not possible, or the number of seeds is not n; nothing has
-                happened then.
+            InputError: If a seed is not possible, or the number of seeds is not n; the environments
+                are then unchanged.
             ResetOptionError: If the mask is not valid; also the errors of ``TPMEnv.reset``.
             EpisodeError: If the environments are closed.
         """
@@ -367,7 +367,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             The observation at that moment.
 
         Raises:
-            InputError: If they are not snapshots of equal environments; nothing has happened then.
+            InputError: If they are not snapshots of equal environments; the environments are then
+                unchanged.
         """
         self._require_open()
         if not isinstance(snapshots, list) or len(snapshots) != len(self._parts):
@@ -397,7 +398,11 @@ class _Part:
     def reset(
         self, rows: IntArray, rngs: Sequence[np.random.Generator | None], options: Any
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start episodes in some environments, with new generators where some are given."""
+        """Start episodes in the environments ``rows``; return observations and infos of all.
+
+        ``rngs`` has an entry for each of the n environments: a new generator, or None if the
+        environment keeps its generator.
+        """
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
         infos, first = {}, not core.rngs
@@ -513,7 +518,11 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return a copy of a step's infos ``last``, with new episodes' infos ``first`` in ``rows``."""
+    """Return a copy of the infos ``last``, in which ``first`` replaces the values of ``rows``.
+
+    ``last`` are the infos of a step, and ``first`` the infos of new episodes in the environments
+    ``rows``.
+    """
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):
