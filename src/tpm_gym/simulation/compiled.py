@@ -365,8 +365,9 @@ def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray
 
     Args:
         shares: (r, k, d, 4) random numbers in [0, 1), four for each candidate. The first three
-            numbers determine the candidate's place in the box. The fourth number of a point's first
-            candidate chooses the box of all its candidates; the other fourth numbers are not used.
+            numbers determine the candidate's place in the box. For each point, the fourth number of
+            the first candidate chooses the box of all candidates for this point; the other fourth
+            numbers are not used.
         boxes: (sum of ``counts``, 2, 3) low and high corners of the boxes: the boxes of the first
             point, then the boxes of the second point, and so on.
         counts: (k,) number of boxes of each point.
@@ -400,7 +401,7 @@ def accepted(
         drawn: (r, k, d, 3) m, d draws for each of the last k points of a row.
         conditioning: (r, k, d) conditioning at the draws.
         least: Smallest conditioning of a chosen draw.
-        most: Upper limit; the conditioning of a chosen draw is smaller.
+        most: Upper limit of the conditioning of a chosen draw; the limit itself is not allowed.
         apart: Smallest distance of a chosen draw from the earlier points of its row, m.
         rows: (r,) indices of the rows of ``points`` for which points are chosen.
         points: (n, j, 3) m, j points of each row; the chosen draws are written to the last k.
@@ -556,9 +557,11 @@ def along(
 def braced_inverse(
     mass: FloatArray, stiffness: FloatArray, damping: float, step: float
 ) -> FloatArray:
-    """Return the inverse (n, 6) of mass + step * (step * stiffness + damping) for each robot.
+    """Return the inverse (n, 6) of the matrix M + step * (step * K + damping * I) of each robot.
 
-    The six columns are the entries 00, 01, 02, 11, 12 and 22 of the symmetric inverse.
+    M is the inertia ``mass`` (n, 3, 3) kg m^2, K is the diagonal matrix of ``stiffness`` (n, 3)
+    N m/rad, and I is the unit matrix. The six columns are the entries 00, 01, 02, 11, 12 and 22 of
+    the symmetric inverse.
     """
     inverse = np.empty((len(mass), 6))
     for row in range(len(mass)):
@@ -587,8 +590,9 @@ def servo_torques(
         index: Index of the time step in the control period.
         references: References of the control period.
         law: Stiffness (n, 3) N m/rad, damping (N m s/rad), inertia (n, 3, 3) kg m^2 that the law
-            assumes, :func:`braced_inverse` of the inertia, largest torques (n, 3) N m, and corner
-            and no-load speed of each motor (3, 2) rad/s.
+            assumes, :func:`braced_inverse` of the inertia, largest torques (n, 3) N m, and two
+            speeds of each motor (3, 2) rad/s: the corner speed, above which the largest torque
+            falls, and the no-load speed, at which it is zero.
         theta: (n, 3) rad, at the beginning of the time step.
         theta_dot: (n, 3) rad/s, at the beginning of the time step.
         step: Time step, s.

@@ -135,7 +135,11 @@ class Readout(NamedTuple):
 
 
 def spline_weights(steps: int) -> FloatArray:
-    """Return weights (steps, 3) of the last three commands, oldest first, after each time step."""
+    """Return the weights (steps, 3) that give the path's point at the end of each time step.
+
+    This point is the sum of the last three commands, each multiplied by its weight. Each row
+    is for one time step; its first weight is for the oldest command.
+    """
     s = np.arange(1, steps + 1) / steps
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
 
@@ -307,8 +311,8 @@ class Engine(Protocol):
     def save(self) -> Any:
         """Return the state that the next time steps depend on, as plain data or arrays.
 
-        The result does not include state that cannot be read, such as contact impulses of the last
-        time step. ``restore`` resets this state.
+        The result does not include values that cannot be read from the engine, such as contact
+        impulses of the last time step. ``restore`` resets these values.
         """
 
     def restore(self, saved: Any) -> None:
@@ -448,6 +452,6 @@ _PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.
 
 
 def _has(engine: Engine, part: str) -> bool:
-    """Return whether an engine has an attribute that it does not inherit from the protocol."""
+    """Return whether ``engine`` has the attribute ``part`` without inheriting it from Engine."""
     own = getattr(engine, part, None)
     return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

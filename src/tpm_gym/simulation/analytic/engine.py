@@ -39,12 +39,12 @@ from tpm_gym.simulation.state import Scene
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _NEAR_PLANE = 1.2
-"""Distance of P from the plane of symmetry normal to ``mirror_axis``, divided by the machine's
-``step_limit`` (m) along this axis.
+"""Limit of the distance from P to the plane of symmetry normal to ``mirror_axis``, divided by the
+machine's ``step_limit`` (m) along this axis.
 
-Beyond this distance, torques are computed from differences of joint positions. At this distance
-and at full speed, P's acceleration normal to the plane, if computed from these differences, has an
-error of 0.2 m/s^2.
+If P is farther from the plane, torques are computed from differences of joint positions. At this
+limit and at full speed, the differences give P's acceleration normal to the plane with an error of
+0.2 m/s^2.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -63,8 +63,8 @@ class AnalyticEngine:
         drive: Servo drives of the motors; None for ideal drives.
 
     Attributes:
-        least_steps: Smallest number of time steps in a control period, because accelerations are
-            computed from the positions at the ends of the last three time steps.
+        least_steps: Smallest allowed number of time steps in a control period: 3. Accelerations
+            are computed from the positions at the ends of the last three time steps.
         torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
             ``physics.torques`` is ``"every"``.
 
@@ -200,7 +200,7 @@ class AnalyticEngine:
 
         The plane is normal to ``mirror_axis``. Near the plane, torques cannot be computed from
         differences of the joint positions. The result is True for all robots if any robot has had
-        encoder bias or length errors.
+        encoder bias or length errors since :meth:`load`.
         """
         if not self._exact:
             return np.ones(self._count, dtype=np.bool_)

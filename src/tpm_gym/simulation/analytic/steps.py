@@ -61,7 +61,8 @@ def ideal_step(
         at: Kinematics and dynamics at the beginning of the time step.
         step: Time step, s.
         new: Output.
-        behind: (2, r) whether a motor was at its limit in the last and in this time step; output.
+        behind: (2, r) whether a motor was at its limit: in the previous time step (first row), and
+            in this time step (second row); updated.
     """
     rate = 1.0 / step
     for row in range(len(effort)):
@@ -212,8 +213,8 @@ def modes_left(
 ) -> tuple[NDArray[np.int8], bool]:
     """Return the mode that each robot has left (r,), and whether any robot has left one.
 
-    When P passes a parallel singularity, the joints reverse. So forward kinematics still return a
-    position, but in the wrong assembly mode. Only ``side`` detects this.
+    After P has passed a parallel singularity, the joint positions also fit a point on the side that
+    P has left. Forward kinematics return this point. So only ``side`` detects the passage.
 
     Args:
         position: (r, 3) m, P by forward kinematics; NaN if there is no assembly.

@@ -20,8 +20,8 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 _SOFTER = 0.5
 """Factor of the stiffness of a held object's contacts, for example with the table.
 
-With factor 1, the table would push a held object upwards against the cup's spring. The spring's
-force, and with it the motors' torques, would be 3% smaller than in PyBullet.
+With factor 1, MuJoCo would push a held object out of the table too fast. Then the force of the
+cup's spring and the torques of the motors would be 3% smaller than in PyBullet.
 """
 
 

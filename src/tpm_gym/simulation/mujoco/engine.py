@@ -45,8 +45,9 @@ class _Saved:
 class MujocoEngine:
     """Engine that simulates one robot with MuJoCo.
 
-    Each call ends with the first half of the next time step (positions, contacts, constraints), so
-    that all values that can be read belong to the same instant.
+    ``place``, ``advance`` and ``restore`` end with the first half of the next time step, which
+    computes positions, contacts and constraints. So all values that can be read belong to the same
+    instant.
 
     Args:
         gui: Whether to open MuJoCo's viewer.

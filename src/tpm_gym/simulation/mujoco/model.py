@@ -92,7 +92,7 @@ def grip_name(index: int) -> str:
 
 
 def _light(root: Element, world: Element) -> None:
-    """Add lights without shadows, a white sky, and the limits of the depth, as in PyBullet."""
+    """Add a white sky, lights that cast no shadows, and the limits of the depth, as in PyBullet."""
     add(root, "statistic", extent=1)  # then the numbers of "map" are metres
     visual = add(root, "visual")
     add(visual, "map", znear=NEAR, zfar=FAR)

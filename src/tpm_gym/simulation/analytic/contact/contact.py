@@ -85,7 +85,7 @@ class Contact:
             tables.belts[rows] = speed
 
     def place(self, rows: IntArray, poses: FloatArray) -> None:
-        """Release held objects, set vacuum to zero, and place all objects without motion.
+        """Release held objects, set the vacuum to zero, and place all objects with zero velocity.
 
         If all objects of a table stand upright on the table top, and its belt does not run, they
         count as at rest immediately.

@@ -116,7 +116,9 @@ def read(
 
 @kept
 def place(tables: Tables, rows: IntArray, poses: FloatArray, setting: Setting) -> None:
-    """Place all objects without motion, as explained in :class:`.contact.Contact`.
+    """Release held objects, and place all objects with zero velocity.
+
+    The details are explained in :meth:`.contact.Contact.place`.
 
     Args:
         poses: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects, world.
