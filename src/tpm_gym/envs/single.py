@@ -99,7 +99,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_offset | 3 | top of the object minus lip of the cup |
     | object_velocity | 3 | velocity of the object, from a camera |
     | object_tilt | 2 | x and y of the object's axis |
-    | object_held | 1 | vacuum by a gauge, 0 to 1; 0 if the object is not held |
+    | object_held | 1 | vacuum, measured by a gauge, 0 to 1; 0 if the object is not held |
 
     The entries of the object are repeated for each object. Push adds the object's turn about the
     vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,

@@ -451,7 +451,7 @@ class Task(ABC):
             (
                 "held",
                 "-",
-                f"vacuum by a gauge, 0 to 1; 0 if the {name} is not held",
+                f"vacuum, measured by a gauge, 0 to 1; 0 if the {name} is not held",
                 (0.5,),
                 (0.5,),
             ),

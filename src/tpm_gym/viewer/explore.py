@@ -116,7 +116,7 @@ class Explore:
             self.gizmo.visible = not hidden
 
     def go_home(self) -> None:
-        """Move to the machine's home, in its own modes."""
+        """Move to the machine's home, in the machine's own modes."""
         self.set(self._kind.home())
 
     def set(self, posture: Posture) -> None:
