@@ -152,7 +152,7 @@ class _Cache:
 
 _CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
 _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
-"""Packages whose functions :func:`stamp` includes by name only; it does not read their sources."""
+"""Packages from which :func:`stamp` includes only the names of functions, not their sources."""
 
 
 def stamp(function: Callable[..., Any]) -> str:

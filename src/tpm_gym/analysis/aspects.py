@@ -25,7 +25,7 @@ from tpm_gym.kinematics.workspace import Region, conditioning_at
 Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)
-"""Numbers of cells along x, y, z; for the paper's lengths, cells of about 27 x 6 x 24 mm."""
+"""Numbers of cells along x, y, z. With the paper's lengths, a cell is about 27 x 6 x 24 mm."""
 _BITS = (1, 2, 4, 8)
 
 
@@ -89,7 +89,13 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Box:
-    """Result of :func:`largest_box`, with volume in m^3 and smallest 1/cond(J) at its nodes."""
+    """Result of :func:`largest_box`.
+
+    Attributes:
+        region: The box. Its corners are centres of cells.
+        volume: Volume of the box, m^3.
+        conditioning: Smallest 1/cond(J) at the centres of the cells in the box.
+    """
 
     region: Region
     volume: float
@@ -279,7 +285,11 @@ _NEIGHBOURS = [
 
 
 def components(codes: IntArray) -> IntArray:
-    """Label the connected sets of equal codes, by union-find on all faces at once."""
+    """Label the connected sets of cells with equal codes.
+
+    Two cells are connected if they have a common face and equal codes. The method is union-find,
+    applied to all such pairs of cells at once.
+    """
     parent = np.arange(codes.size)
     index = parent.reshape(codes.shape)
     joined = [(a, b, codes[a] == codes[b]) for a, b in _NEIGHBOURS]

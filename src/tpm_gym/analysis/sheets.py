@@ -53,13 +53,13 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x, z and length of the vector from A2 to B1, and a coordinate of B2, m.
+    """Return x, z and length of the vector from A2 to B1, and the position of B2 on a line, m.
 
-    All values are for theta_1 = ``t``, and for points projected on the plane y = 0. Imagine leg 2,
-    together with A2, shifted until C2 coincides with C1. If the planar factor is zero, rods 4 and 6
-    lie on one line after this shift. On this line, B1 has the coordinate 0, and the coordinate
-    increases in the direction from B2 to C2. The coordinate of B2 is never positive. Its absolute
-    value is the distance from B1 to B2 in the triangle A2B1B2. ``side`` is -1 if the rods point in
+    Here A2, B2 and C2 are the points of leg 2 after a shift by 2 l5 along x, so that C2 coincides
+    with C1. All points are projected on the plane y = 0, and theta_1 is ``t``. If the planar factor
+    is zero, rods 4 and 6 lie on one line after the shift. The position on this line is 0 at B1 and
+    increases from B2 to C2. The position of B2 is never positive. Its absolute value is the
+    distance from B1 to B2, a side of the triangle A2B1B2. ``side`` is -1 if the rods point in
     opposite directions, else 1.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
@@ -209,9 +209,10 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
 
 
 def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, float]]:
-    """Return the intervals of the angle, from 0 to 2 pi, in which a function is positive.
+    """Return the intervals of an angle, from 0 to 2 pi, in which the function ``real`` is positive.
 
-    Intervals shorter than the distance between two sampled angles are found too.
+    The function is computed at equally spaced angles. Intervals shorter than the distance between
+    two of these angles are found too.
     """
     t = np.linspace(0.0, 2 * np.pi, _GRID + 1)
     values = real(t)
@@ -236,7 +237,8 @@ def _zoom(
 ) -> FloatArray:
     """Return the arguments (n,) at which n functions are smallest, between ``low`` and ``high``.
 
-    ``function`` converts arguments (n, nodes), a row for each function, to values (n, nodes).
+    ``function`` computes all n functions together. Row i of its argument (n, m) has m arguments of
+    function i. Row i of its result (n, m) has the m values of this function.
     """
     steps, rows = np.linspace(0, 1, _NODES), np.arange(len(low))
     found = low
@@ -291,7 +293,7 @@ def _feet(
     link3 = points - [g.l2, 0, 2 * g.l6]  # C1 if link 7 had length 0
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
-        """Return three distances, m, from circles to the points ``rows`` (..., 3) m.
+        """Return three lengths, m, that locate the points ``rows`` (..., 3) m relative to circles.
 
         The circles have the centres (x, 0, z) and the radius l7, and are parallel to the plane xy.
         The first result is the distance from the circle to the point. The second result is x of
@@ -303,7 +305,10 @@ def _feet(
         return np.hypot(radius - g.l7, rows[..., 2] - z), level, radius
 
     def belongs(point: Point, level: FloatArray, radius: FloatArray) -> BoolArray:
-        """Return whether points of a curve belong to the working mode."""
+        """Return whether points of a curve belong to the working mode.
+
+        ``level`` and ``radius`` are the second and third result of offset().
+        """
         ours: BoolArray = (point[2] * radius + point[3] * level > 0) & (mode.cos_beta * level > 0)
         return ours
 
@@ -317,9 +322,10 @@ def _feet(
     low, all_ = cell.astype(np.float64) * step, np.arange(len(cell))
 
     def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
-        """Return points of k cells, and the results of offset() and belongs() for these points.
+        """Return points on k arcs, and the results of offset() and belongs() for these points.
 
-        ``cells`` (k,) are indices into ``row`` and ``arc``, which list the cells to search.
+        Entry i of ``row``, ``arc`` and ``cell`` is one search: for the nearest point to the point
+        ``row[i]``, in cell ``cell[i]`` of arc ``arc[i]``. ``cells`` (k,) are indices i of searches.
         ``t`` (k, ...) is as in :meth:`_Arcs.at`.
         """
         point, rows = arcs.at(arc[cells], t), link3[row[cells]]

@@ -3,8 +3,8 @@
 Two independent counts of the degrees of freedom start from the axes of the joints:
 
 * :func:`analyse` applies Eqs. (1) to (5) to branches I, II, III and the pair R12, R13.
-* :func:`mobility` computes the rank of the closure Jacobian of the mechanism that engines load,
-  with all rods and balls of the parallelograms.
+* :func:`mobility` computes the rank of the closure Jacobian. It uses the mechanism that PyBullet
+  and MuJoCo load, with all rods and ball joints of the parallelograms.
 
 The counts agree at singularities too. If z_C1 = z_B1, both counts are 4 instantaneous freedoms,
 because link 3' can begin to turn about y. Vectors are in the paper frame. Functions of joint angles

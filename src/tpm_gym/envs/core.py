@@ -49,7 +49,7 @@ INFO: Final = {
     "object_lost": bool,
     "reward_terms": dict,
 }
-"""Types of the entries of every info by name; the task's events are further entries."""
+"""Type of each entry that all infos have. The events of a task are further entries."""
 
 _TAKEN: Final = ("randomisation", "final_obs", "final_info", "episode")
 """Other names of info entries that a task must not use: this package or Gymnasium adds them."""
@@ -64,11 +64,12 @@ class EnvSnapshot:
     """Everything that the next steps of n environments depend on.
 
     Attributes:
-        kind: Task and options. Environments with other values cannot restore the snapshot.
-        simulation: The simulation's part.
-        rngs: States of the n generators, with their seeds.
-        columns: Arrays by name: goals and delayed actions. Vector environments add the lengths
-            and ends of their episodes.
+        kind: Task and options. Environments with another task or with other options cannot restore
+            the snapshot.
+        simulation: Snapshot of the simulation.
+        rngs: States of the n random generators, with their seeds.
+        columns: Arrays by name: goals, delayed actions, and delayed camera measurements. A vector
+            environment adds the number of steps of each episode, and whether the episode has ended.
     """
 
     kind: Mapping[str, Any]
@@ -356,7 +357,10 @@ class Core:
         return self._state
 
     def save(self, **columns: NDArray[Any]) -> EnvSnapshot:
-        """Return everything that the next steps depend on, with the caller's own columns.
+        """Return a snapshot of everything that the next steps depend on.
+
+        Args:
+            columns: Further arrays to keep in the snapshot, by name.
 
         Raises:
             EpisodeError: If no episode is running.

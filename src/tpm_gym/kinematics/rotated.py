@@ -222,14 +222,17 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
 
     def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return rho^2, p and q, where the closure of rod 6 is 2 rho p = q."""
+        """Return rho^2, p and q at a tilt; |rho| is the distance from B1 to C1 seen along y, m.
+
+        The closure of rod 6 is 2 rho p = q.
+        """
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rho2 = reach2 - (2 * g.l5 * n.imag) ** 2
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
         return rho2, _dot(kappa, n), q
 
     def closures(rho: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
-        """Return the closures of rods 4 and of rod 6, m^2, and the derivatives by rho and tilt."""
+        """Return the closures of rods 4 and rod 6, m^2, and their derivatives by rho and tilt."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
         gaps = rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2, abs(rod6) ** 2 - g.l4**2

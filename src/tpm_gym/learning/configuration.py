@@ -114,7 +114,7 @@ class EnvOptions:
 GivenEnvOptions = Annotated[
     tyro.conf.OmitArgPrefixes[EnvOptions], tyro.conf.arg(name="environment")
 ]
-"""Options of an environment in a group of their own in the help."""
+"""Options of an environment. The help shows them as a separate group."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,8 @@ class TrainingConfig:
     """Weight of the singularity penalty in the reward; 0 for none."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """Goals: sampled everywhere, or only next to the singularity (tempting)."""
+    """Places of goals: "sampled" is anywhere in the task region, "tempting" is only next to a
+    singularity of the robot."""
 
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
@@ -305,7 +306,10 @@ def _in_whole_rollouts(config: TrainingConfig, reached: int) -> TrainingConfig:
 
 
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
-    """Apply the given options to the ``stored`` configuration of a run at the step ``reached``."""
+    """Return the ``stored`` configuration of a run, with the options in ``config`` applied.
+
+    ``reached`` is the number of steps that the run has taken.
+    """
     found = _stored(config.run, stored)
     if config.env not in (UNSET, found.env):
         raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")
@@ -415,7 +419,7 @@ def _check_recipe(config: TrainingConfig) -> None:
 def _check_device(device: str) -> None:
     """Refuse a device that PyTorch does not have.
 
-    PyTorch itself would refuse the device too late: an earlier run in the folder would be deleted.
+    PyTorch itself would refuse the device only after an earlier run in the folder was deleted.
     """
     import torch
 

@@ -137,7 +137,11 @@ class Dataset:
 
     @property
     def training(self) -> TrainingConfig:
-        """Training of kind replay; a ConfigError if there is no recipe or the seed is refused."""
+        """Configuration of the training whose policies play the episodes of kind ``replay``.
+
+        Raises:
+            ConfigError: There is no recipe for the environment, or an option is refused.
+        """
         seed, steps, options = self.config.seed, self.config.steps, self.config.env_options
         return complete(TrainingConfig(env=self.env, seed=seed, steps=steps, env_options=options))
 

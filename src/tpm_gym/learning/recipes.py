@@ -35,7 +35,7 @@ class Recipe:
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: Other arguments of the algorithm's constructor.
-        written_for: Id under which the recipe is in its file.
+        written_for: Environment id that the recipe has in the recipe file.
     """
 
     n_timesteps: int
@@ -114,8 +114,8 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
     """Return the alphabetically first algorithm with a recipe for an id.
 
-    If no algorithm has a recipe for the id, return the first algorithm whose recipe of
-    pick-and-place the id can use (see :func:`read_recipe`). Without such an algorithm,
+    If no algorithm has a recipe for the id, return the first algorithm that has a recipe of
+    pick-and-place which the environment can use (see :func:`read_recipe`). If there is none either,
     return ``"sac"``.
 
     Args:

@@ -48,7 +48,10 @@ class Mount:
         return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
 
     def rotate(self, vector: ArrayLike) -> FloatArray:
-        """Convert free vectors (..., 3), such as velocities, in either direction."""
+        """Convert velocities or other free vectors (..., 3) between paper frame and world frame.
+
+        The conversion is the same in both directions.
+        """
         turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
         return turned
 

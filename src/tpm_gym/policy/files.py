@@ -226,7 +226,10 @@ def published() -> list[str]:
 
 
 def _refused(file: Path, cause: str) -> PolicyFileError:
-    """Return an error. ``cause`` may quote the file, so its text is cut and made printable."""
+    """Return the error for a file that is not a valid policy file.
+
+    The text ``cause`` is cut and made printable, because it may quote the file.
+    """
     reason = f"is not a policy file: {cause[:200].encode('unicode_escape').decode()}"
     remedy = "get an intact copy of both files, export the policy again, or update tpm_gym"
     return PolicyFileError(str(file), reason, remedy)

@@ -29,7 +29,16 @@ from tpm_gym.simulation.state import Belt, Block
 
 
 class Reading(NamedTuple):
-    """State of objects and cups on n tables; as in :class:`tpm_gym.simulation.engine.Readout`."""
+    """State of the k objects and the cup on each of n tables, in the world frame.
+
+    Attributes:
+        position: (n, k, 3) m, centres of the objects.
+        quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
+        velocity: (n, k, 3) m/s, velocities of the objects.
+        angular_velocity: (n, k, 3) rad/s, angular velocities of the objects.
+        held: (n,) index of the object in the cup; -1 for none.
+        vacuum: (n,) Pa below the ambient pressure.
+    """
 
     position: FloatArray
     quaternion: FloatArray
@@ -137,7 +146,7 @@ class Contact:
             own[rows] = earlier[rows]
 
     def save(self) -> FloatArray:
-        """Return the state of all tables as an array (n, c)."""
+        """Return the state of all tables as an array (n, c): c numbers for each table."""
         return np.concatenate(self._plain(), axis=1)
 
     def restore(self, saved: FloatArray) -> None:
