@@ -1,7 +1,7 @@
 """Simulation of n robots with any engine.
 
-The engine simulates the robots. This module adds encoder errors, records which modes the robots
-have left, and computes the State.
+The engine simulates the robots. This module adds encoder errors, records which robots have left
+their assembly mode or working mode, and computes the State.
 """
 
 from __future__ import annotations
@@ -37,12 +37,11 @@ CLOSURE_LIMIT = 0.005
 _STEPS = 10  # time steps in a control period other than 40 ms, if the settings have none
 
 _BLUR = 0.05
-"""Distance from P to the machine's plane of symmetry that halves the observed velocity of P.
+"""Distance between P and the machine's plane of symmetry, as a fraction of a step limit.
 
-The plane is normal to ``mirror_axis``, and the distance is a fraction of the machine's
-``step_limit`` along this axis. If P is at this distance, the observed velocity normal to the plane
-is half of the component of J theta_dot normal to the plane. If P is in the plane, the observed
-velocity normal to the plane is zero.
+If P is at this distance, the observed velocity of P normal to the plane is half of the component of
+J theta_dot normal to the plane. If P is in the plane, this observed velocity is zero. The plane is
+normal to ``mirror_axis``. The step limit is the machine's ``step_limit`` along this axis.
 """
 
 _COLUMNS = (

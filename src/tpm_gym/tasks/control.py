@@ -84,7 +84,7 @@ class CartesianControl:
         return float((np.abs(wanted - current) / self._step).max())
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide by the step limit."""
+        """Divide ``points`` by the step limit."""
         return points / self._step
 
     def rate(self, points: FloatArray) -> FloatArray:
@@ -184,12 +184,12 @@ class JointControl:
         return float(max(turns / self._turn, axes))
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide the joint positions by the joint limit."""
+        """Divide the joint positions at ``points`` by a joint's largest change per control step."""
         places: FloatArray = self._machine.inverse(points) / self._turn
         return places
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Multiply J by the joint limit."""
+        """Multiply J at ``points`` by a joint's largest change per control step."""
         theta = self._machine.inverse(points)
         rate: FloatArray = self._machine.evaluate(theta).jacobian * self._turn
         return rate
@@ -220,12 +220,12 @@ class Follower:
         self._most = USABLE * np.array([motor.effort for motor in machine.mechanism.motors])
 
     def limit(self, wanted: FloatArray, current: FloatArray, before: FloatArray) -> FloatArray:
-        """Return the commands (n, 3) m near ``wanted`` that can be followed.
+        """Return commands (n, 3) m close to ``wanted`` that the motors can follow.
 
         Args:
-            wanted: (n, 3) m, commands of a control.
+            wanted: (n, 3) m, the next commands, before they are limited.
             current: (n, 3) m, the last commands.
-            before: (n, 3) m, the commands before the last.
+            before: (n, 3) m, the commands before ``current``.
         """
         last, change, brake = current - before, self._change, self._brake
         step = np.clip(wanted - current, last - change, last + change)
@@ -246,7 +246,11 @@ class Follower:
         return commands
 
     def feasible(self, before: FloatArray, current: FloatArray, then: FloatArray) -> BoolArray:
-        """Return whether the motors' peak torques allow the spline of three commands, (n,)."""
+        """Return an array (n,): whether the motors' peak torques suffice in the middle of a path.
+
+        The control points of the path are the commands ``before``, ``current`` and ``then``, each
+        (n, 3) m.
+        """
         (torques,) = np.abs(self._torques(before, current, then[None]))
         enough: BoolArray = (torques <= self._most / USABLE).all(axis=-1)
         return enough

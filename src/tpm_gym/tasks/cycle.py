@@ -34,9 +34,9 @@ SPEED: Final = 5.0
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
-"""Largest RMS torque of the plan / peak torque; 2% of the continuous torque is kept for servos."""
+"""Largest RMS torque of a plan, as a share of the peak torque; 0.98 leaves a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Acceleration limits (x, y, z), as shares of P's largest acceleration along that axis alone."""
+"""Acceleration limits along x, y, z: shares of P's largest acceleration along each axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
@@ -46,7 +46,7 @@ to brake along x and z at the same time.
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth, m: the reward term is -1 if P is below the gate by the tolerance plus this depth."""
+"""Depth, m. If P is below the gate-shaped way by tolerance + UNIT, the reward term "gate" is -1."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the gate between two markers."""
@@ -62,10 +62,10 @@ class Cycle(Task):
     corners that are rounded over 50 mm. The reward has a term for every step in which P is more
     than 2 mm below this gate.
 
-    Actions come every 4 ms. The command moves at up to 5 m/s. If a change of its velocity would
-    need more than 95% of the peak torque by closed-form dynamics, the change is reduced. A gripper
-    holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could not: it holds 12 N,
-    and 0.1 kg needs up to 15 N here.
+    Actions come every 4 ms. The command moves at up to 5 m/s. A change of the command's velocity is
+    reduced if, according to closed-form dynamics, the change needs more than 95% of the peak
+    torque. A gripper holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could
+    not hold the payload: the cup holds 12 N, and 0.1 kg needs up to 15 N here.
     """
 
     scene = Scene(markers=POINTS // SHOWN + 1, marker_radius=0.004)
@@ -199,7 +199,7 @@ class Cycle(Task):
         return {"gate": np.minimum(-below / UNIT, 0.0)}
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Follow the gate at the highest speed that the motors can repeat without overheating."""
+        """Follow the gate as fast as possible; repeating this must not overheat the motors."""
         start, goal = motion.command, self.machine.mount.to_paper(motion.goal)
         path = self.gate(start[1], backwards=bool(start[0] > goal[0]))
         times, _ = timed(self.machine, path, CONTINUOUS * self._peak, USABLE * self._peak)

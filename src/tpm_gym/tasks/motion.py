@@ -153,7 +153,7 @@ class Motion:
         way. The sum of the speeds of these two ways does not exceed the largest speed of one way.
 
         Args:
-            ways: For each way, the covered fractions by :meth:`trapezoid`.
+            ways: For each way, the fractions that :meth:`trapezoid` returns.
         """
         lengths = np.array([len(way) for way in ways])
         begins = np.cumsum([0, *np.maximum(lengths[:-1] - self._ramp + 1, 0)])

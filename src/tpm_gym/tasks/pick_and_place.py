@@ -58,7 +58,7 @@ class PickAndPlace(Task):
 
     @cached_property
     def _regions(self) -> dict[str, list[Region]]:
-        """Regions of P while the cup holds the block: at a start ("object"), at a goal ("goal")."""
+        """Regions of P with the block in the cup; key "object": at starts, key "goal": at goals."""
         table = self.on_table(self.block)
         x, y, level = table.high
         air = Region(self.machine.goal_region.low, (x, y, level - sampling.APART))

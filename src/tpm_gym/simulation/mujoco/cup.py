@@ -111,7 +111,11 @@ class Cup:
         return -1
 
     def _sealed_pose(self, index: int) -> Pose:
-        """Return the pose of an object in the tool's frame, at least 20 um below the cup."""
+        """Return the pose of an object in the tool's frame, for the weld to the cup.
+
+        If the gap between lip and object is less than 20 um, the pose is moved down until the gap
+        is 20 um.
+        """
         origin, turn = self._robot.tool()
         position, quaternion = self._scenery.pose(index)
         lip, _ = self._robot.cup()

@@ -51,8 +51,9 @@ class MujocoEngine:
 
     Args:
         gui: Whether to open MuJoCo's viewer.
-        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``. If None, the renderer that the environment
-            variable ``MUJOCO_GL`` names; if it names none of the three, the first that works.
+        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``. If None, the environment variable
+            ``MUJOCO_GL`` names the renderer. If the variable has none of these three names, the
+            first renderer that works is used.
         physics: A :class:`Physics` or a mapping of its attributes.
         drive: Servo drives of the motors; None for ideal drives.
 

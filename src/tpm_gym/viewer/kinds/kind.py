@@ -124,11 +124,13 @@ class Kind:
             position: Point P, machine's frame.
             operation: Operation mode.
             working: Working mode.
-            tilt: Preferred tilt, rad. Of several rotated postures, the nearest in tilt is returned.
+            tilt: Preferred tilt, rad. If several rotated postures exist, the posture whose tilt is
+                nearest to this value is returned.
 
         Raises:
-            InputError: If position is not three finite numbers, or no rotated posture exists there.
-            UnreachableError: If a leg does not reach.
+            InputError: If ``position`` is not three finite numbers, or ``operation`` is "rotated"
+                and no rotated posture exists at ``position``.
+            UnreachableError: If ``operation`` is "translating" and ``position`` is out of reach.
         """
         del operation, working, tilt
         theta = self.machine.require_inverse(np.array(vector("position", position)))
@@ -138,9 +140,10 @@ class Kind:
         """Solve the posture with the motors at ``theta`` (3,) rad, in an assembly mode.
 
         Raises:
-            InputError: If theta is not three finite numbers, or ``assembly`` is of the rotated
-                operation mode and has no posture at theta.
-            UnreachableError: If any other ``assembly`` has no posture at theta.
+            InputError: If ``theta`` is not three finite numbers, or ``assembly`` belongs to the
+                rotated operation mode and has no posture at ``theta``.
+            UnreachableError: If ``assembly`` belongs to the translating operation mode and has no
+                posture at ``theta``.
         """
         angles = vector("theta", theta)
         found = self.machine.require_evaluate(np.array(angles))

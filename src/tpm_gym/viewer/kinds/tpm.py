@@ -54,7 +54,8 @@ class TPMKind(Kind):
     def __init__(self, machine: TPM) -> None:
         """Store the machine, and label its working modes.
 
-        The label of an elbow is "out" if it is bent as in the machine's working mode, else "in".
+        An elbow that is bent as in the machine's own working mode has the label "out". Other
+        elbows have the label "in".
         """
         super().__init__(machine)
         self.working = {
