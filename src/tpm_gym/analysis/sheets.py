@@ -53,14 +53,14 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x, z and length of the vector from A2 to B1, and a coordinate of B2, m.
+    """Return x, z and length of the vector from a shifted A2 to B1, and a coordinate of B2, m.
 
-    All values are for theta_1 = ``t``, and for points projected on the plane y = 0. Imagine leg 2,
-    together with A2, shifted until C2 coincides with C1. If the planar factor is zero, rods 4 and 6
-    lie on one line after this shift. On this line, B1 has the coordinate 0, and the coordinate
-    increases in the direction from B2 to C2. The coordinate of B2 is never positive. Its absolute
-    value is the distance from B1 to B2 in the triangle A2B1B2. ``side`` is -1 if the rods point in
-    opposite directions, else 1.
+    The arm of leg 1 is at theta_1 = ``t``. All points are projected on the plane y = 0. Imagine leg
+    2, together with A2, shifted until C2 coincides with C1; A2 and B2 are here the shifted points.
+    If the factor ``planar`` (see :class:`.Factors`) is zero, rods 4 and 6 lie on one line after the
+    shift. On this line, B1 has the coordinate 0, and the coordinate increases in the direction from
+    B2 to C2. The coordinate of B2 is never positive. Its absolute value is the distance from B1 to
+    B2 in the triangle A2B1B2. ``side`` is -1 if the rods point in opposite directions, else 1.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
     rod = side * np.sqrt(np.maximum(_rod_4(g, t)[1], 0.0))

@@ -123,7 +123,7 @@ class Conveyor(Task):
         return [(low, high)]
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, of each block, and of the belt."""
+        """Return the observation's entries of the robot, of each block, and of the belt."""
         middle, half = sum(SPEEDS) / 2, (SPEEDS[1] - SPEEDS[0]) / 2
         meaning = "speed of the belt, by its encoder"
         speed = Entry("belt_speed", "m/s", meaning, (middle,), (half,), _belt_speed)

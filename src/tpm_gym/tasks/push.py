@@ -110,7 +110,7 @@ class Push(Task):
         return point
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of the block, which include its rotation."""
+        """Return the observation's entries: the robot's, and the block's with its rotation."""
         return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:

@@ -59,7 +59,7 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
 
 
 def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> FloatArray:
-    """Cut m flat grids of points (m, a, b, 3) at the boundary of a region.
+    """Cut k flat grids of points (k, a, b, 3) at the boundary of a region.
 
     Grid points next to the region move to its boundary. Points farther outside become NaN.
     """
@@ -79,11 +79,12 @@ def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> Fl
 
 
 def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """Return the points P (m, a, b, 3) of the surface on which a factor is zero.
+    """Return points of the surface on which a factor is zero, (k, rows, columns, 3) m.
 
-    The factor depends on the position of C1 alone, and is zero where C1 is on certain curves. For
-    each position of C1 on these curves, link 7 can turn P along a half circle. Points of other
-    working modes are NaN.
+    The factor depends on the position of C1 alone, and is zero where C1 is on one of k curves. For
+    each curve, there is a grid of points P. A row of the grid belongs to a position of C1 on the
+    curve. The points of the row are on a half circle, along which link 7 can turn P. Points of
+    other working modes are NaN.
     """
     x, z, p, q = (part[..., None] for part in sheets.curves(factor, mode, g))
     beta = np.linspace(-np.pi / 2, np.pi / 2, _AROUND)
@@ -94,7 +95,7 @@ def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
 
 
 def _planes(factor: str, g: Geometry) -> FloatArray:
-    """Return points (m, a, b, 3) where sin(beta) = 0 (plane y = 0) or cos(beta) = 0 (|y| = l7)."""
+    """Return points (k, a, b, 3) where sin(beta) = 0 (plane y = 0) or cos(beta) = 0 (|y| = l7)."""
     reach = g.l3 + g.l4
     x = np.linspace(-g.l1 - reach - g.l7, g.l1 + reach + g.l7, 241)
     z = np.linspace(-reach, reach + 2 * g.l6, 181)
@@ -124,7 +125,7 @@ SURFACES: Final = {
 
 
 def grid_mesh(points: FloatArray) -> Mesh:
-    """Join neighbouring points of grids (m, a, b, 3) to triangles; leave out NaN points."""
+    """Join neighbouring points of k grids (k, a, b, 3) to triangles; leave out NaN points."""
     real = ~np.isnan(points[..., 0])
     index = np.arange(real.size).reshape(real.shape)
     corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]
