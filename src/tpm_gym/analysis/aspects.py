@@ -2,7 +2,7 @@
 
 The platform can move between two points of one aspect without a singularity (Wenger and Chablat).
 Between two aspects of one working mode, every path passes a singularity. Sets are grids of cells in
-the paper frame, in metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only
+the paper's frame, in metres. The singular planes y = 0 and |y| = l7 are faces of cells, so only
 curved surfaces run through cells. All factors of :mod:`tpm_gym.analysis.singularity` are taken
 into account. Other limits, such as the stops of the motors, are taken into account only if they are
 given (:mod:`tpm_gym.analysis.limits`).
@@ -281,7 +281,7 @@ def _signs(
 _NEIGHBOURS = [
     tuple((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
     for axis in range(3)
-]  # for each axis, two views of a grid whose entries share a face
+]  # for each axis, two views of a grid; cells at equal indices share a face
 
 
 def components(codes: IntArray) -> IntArray:

@@ -3,8 +3,8 @@
 A configuration is singular where one of eight factors is zero. Three parallel factors make up
 det A and four serial factors make up det B (Eqs. 16 and 17, corrected). The eighth factor is the
 elevation z_C1 - z_B1 of rods 4. If the elevation is zero, nothing keeps link 3' from turning about
-y. The paper does not have this constraint singularity. All values are in the paper frame, in m and
-rad.
+y. The paper does not have this constraint singularity. All values are in the paper's frame, in m
+and rad.
 
 Functions of angles or points take arrays (..., 3) of numbers and raise InputError for anything
 else. The functions that classify also raise InputError for numbers that are not finite,

@@ -58,7 +58,7 @@ class Rendering:
 
 
 class Pixels:
-    """Pictures as observations; they replace the entries of the objects.
+    """Pictures as observations; they replace the objects' entries of the observation vector.
 
     Raises:
         ConfigurationError: If an option is out of range.

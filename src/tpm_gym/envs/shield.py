@@ -1,14 +1,15 @@
 """Shield: the nearest command that keeps the machine away from singularities.
 
-Let c be the last command, m the middle between c and the command before c, and d the next command.
-In a control period, point P follows the Bezier curve with the control points m, c and (c + d) / 2.
+Let c be the last command, b the middle between c and the command before c, and d the next command.
+In a control period, point P follows the Bezier curve with the control points b, c and (c + d) / 2.
 If the command then stays at d, P moves on to d in a straight line. The command d is safe if the
-conditioning 1/cond(J) stays at ``least`` or above on curve and line. So it is always safe to hold
-the last command c: P then moves on the line from m to c, and the check of c included this line.
+conditioning 1/cond(J) stays at ``least`` or above on this curve and this line. So it is always safe
+to hold the last command c: P then moves on the line from b to c, and the check of c included this
+line.
 
-Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex.
-Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning =
-least``. This point is found by sequential quadratic programming, and its path is checked. If the
+The curve and the line lie in the triangle of b, c and d. The safe part of the region is almost
+convex. Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning
+= least``. This point is found by sequential quadratic programming, and its path is checked. If the
 check fails, the search is repeated with a larger conditioning as its aim. If all searches fail, the
 command is moved towards the last command.
 
@@ -58,8 +59,8 @@ _NUDGE = 1e-4  # displacement for derivatives of the conditioning, as a fraction
 
 @cache
 def _nodes() -> FloatArray:
-    """Return weights (7, 3) of m, c and d for seven points: five on the curve, two on the line."""
-    s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
+    """Return weights (7, 3) of b, c and d for seven points: five on the curve, two on the line."""
+    s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 b + 2 s (1-s) c + s^2 (c + d) / 2
     curve = np.hstack([(1 - s) ** 2, 2 * s * (1 - s) + s**2 / 2, s**2 / 2])
     return np.vstack([curve, [[0.0, 0.25, 0.75], [0.0, 0.0, 1.0]]])
 
@@ -131,7 +132,7 @@ class Shield:
         return command
 
     def _lack(self, corners: FloatArray) -> FloatArray:
-        """Return the conditioning (r,) that paths lack; their corners m, c, d are (r, 3, 3) m."""
+        """Return the conditioning (r,) that paths lack; their corners b, c, d are (r, 3, 3) m."""
         return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
@@ -291,7 +292,7 @@ def make_shield(
 
 
 def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
-    """Return the smallest conditioning (r,) on paths; their corners m, c, d are (r, 3, 3)."""
+    """Return the smallest conditioning (r,) on paths; their corners b, c, d are (r, 3, 3) m."""
     points = loops().spline_points(corners, _nodes())
     found: FloatArray = lowest(machine.conditioning_at(points))
     return found
@@ -299,9 +300,10 @@ def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
 
 @kept
 def lowest(values: FloatArray) -> FloatArray:
-    """Return the smallest values (r,) on curve and line, from the values (r, 7) at the nodes.
+    """Return the smallest value on each of r paths, (r,), from the values (r, 7) at seven nodes.
 
-    Between nodes, values are interpolated by parabolas through three successive nodes.
+    A path is a curve with the nodes 0 to 4, and then a straight line with the nodes 4 to 6. Between
+    nodes, values are interpolated by parabolas through three successive nodes.
     """
     found = np.empty(len(values))
     for row in range(len(values)):
@@ -331,9 +333,9 @@ def solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Solve problems with linearised conditioning, by Hildreth's method.
 
-    For each constraint in turn, the point is pushed until the constraint holds with equality. If
-    the constraint holds with a reserve, the point is moved back, but not farther than this
-    constraint has pushed it in total.
+    The constraints are treated in turn. If a constraint is violated, the point is pushed until the
+    constraint holds with equality. If a constraint holds with a reserve, the point is moved back,
+    but not farther than this constraint has pushed it in total.
 
     Args:
         point: (r, 3) m, where the conditioning is linearised.

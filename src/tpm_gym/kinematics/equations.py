@@ -269,11 +269,15 @@ def regular(values: Factors, g: AnyLengths) -> Numbers:
 def link_velocity(
     bars: tuple[Triple, Triple, Triple], values: Factors
 ) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers], Triple]:
-    """Compute the rates of xC, zC and l7 beta for unit rates of the motors, m/rad.
+    """Compute the derivatives of xC, zC and the product l7 * beta by the joint positions, m/rad.
 
-    The rates solve a linear system: the equations of the loop closures, differentiated with respect
-    to time. The determinant of this system is sin(beta) * level3 * planar. Motor 3 does not move
-    link 3'.
+    They solve a linear system: the equations of the loop closures, differentiated with respect to
+    time. The determinant of this system is the product of sin(beta) and the factors ``level3`` and
+    ``planar`` in :class:`Factors`.
+
+    Returns:
+        Derivatives of xC and of zC by theta_1 and theta_2 (motor 3 does not move link 3'), and of
+        l7 * beta by all three joint positions.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
     # Divisions take longer than all else, so each divisor is inverted once.

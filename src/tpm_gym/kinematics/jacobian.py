@@ -1,4 +1,4 @@
-"""Jacobians, their singular factors, and conditioning, for batches, in the paper frame.
+"""Jacobians, their singular factors, and conditioning, for batches, in the paper's frame.
 
 The closures are f_i = |B_iC_i|^2 - l4^2 = 0. Their derivatives by time are A v = B theta_dot, with
 the platform's velocity v (section "Singularity analysis"). Configurations are given by the actuated

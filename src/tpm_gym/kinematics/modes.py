@@ -120,8 +120,8 @@ class ForwardSolutions:
     """All solutions of the forward kinematics, one slot per :data:`ASSEMBLY_MODES` entry.
 
     Attributes:
-        position: (..., 4, 3) m, point P in the paper frame; NaN where the branch is not real. Where
-            the mechanism closes for every beta (see ``free``), x and y are NaN, but z is not.
+        position: (..., 4, 3) m, point P in the paper's frame; NaN where the branch is not real.
+            Where the mechanism closes for every beta (see ``free``), x and y are NaN, but z is not.
         beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where the branch is not real.
         valid: (..., 4) bool, whether the branch is real.
         geometry: Lengths of the mechanism.

@@ -5,8 +5,9 @@ orders the branches. Torch tensors give tensors on the same device, in float64, 
 differentiated. Where branches merge, the derivative is 0 instead of infinite.
 
 All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions on all
-branches return invalid branches for entries that are not finite. Functions on one branch raise
-InputError for such entries, and UnreachableError if the branch does not exist for some entry.
+branches return invalid branches for points and angles that are not finite. Functions on one branch
+raise InputError for these. They raise UnreachableError if the branch does not exist for one of the
+points or triples of angles.
 """
 
 import math

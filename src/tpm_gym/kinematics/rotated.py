@@ -85,7 +85,10 @@ class RotatedPostures:
 
     @property
     def rods(self) -> FloatArray:
-        """Vectors along rods 4a, 4b and 6, and B3C3 (parallel to both rods 11), (..., 4, 3) m."""
+        """Four vectors (..., 4, 3) m: along rods 4a, 4b and 6, and from B3 to C3.
+
+        The last one is parallel to rods 11a and 11b.
+        """
         half = np.array([self.geometry.l5, 0.0, 0.0])
         b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
         feet: FloatArray = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
@@ -333,7 +336,10 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'; find if rods 11 fit."""
+    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'.
+
+    The second result tells whether rods 11a and 11b can reach link 7.
+    """
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)
     u, w = to_c1.real + 2 * g.l2, to_c1.imag + g.l6
@@ -382,8 +388,8 @@ def velocity(postures: RotatedPostures) -> FloatArray:
     """Compute rates of P (m/rad) and the tilt (rad/rad) for unit rates of the motors, (..., 4, 3).
 
     The rates keep the lengths of all rods. Rods 4a, 4b and 6 give the velocity and the turn of link
-    3', and rods 11 give the rate of link 7. At a parallel singularity, and where the two operation
-    modes meet, the rates are not finite.
+    3', and rods 11a and 11b give the rate of link 7. At a parallel singularity, and where the two
+    operation modes meet, the rates are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends
     rates = _elbow_rates(postures.theta, g)[..., [0, 0, 1, 2], :]

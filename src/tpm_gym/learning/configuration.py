@@ -324,7 +324,7 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
 
 
 def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
-    """Build the configuration of a run; refuse missing entries, and entries of other types."""
+    """Build the configuration of a run; raise RunError if an entry of it is missing or invalid."""
     names = {entry.name for entry in fields(TrainingConfig)} - {"overwrite"}
     text = json.dumps({CONFIG_FILE: {name: stored.get(name) for name in names}})
     kind = TypeAdapter(dict[str, TrainingConfig], config=ConfigDict(strict=True, extra="forbid"))

@@ -143,7 +143,7 @@ def shipped_for(env_id: str) -> list[str]:
 
 
 def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """Return entries of a recipe with classes in place of their names."""
+    """Return a copy of a recipe's entries in which classes replace their names."""
     found = dict(entries)
     if "replay_buffer_class" in found:
         from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
@@ -186,7 +186,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
 
 
 def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
-    """Read and check all recipes of a file: environment id -> entries."""
+    """Read and check all recipes of a file: environment id -> entries of its recipe."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -201,7 +201,13 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
-    """Raise ConfigError if recipes (name -> entries) have an unknown key or an invalid value."""
+    """Raise ConfigError if recipes have an unknown key or an invalid value.
+
+    Args:
+        source: File or option that the message names as the origin of the recipes.
+        recipes: Entries of each recipe, by name.
+        algorithm: Name of the algorithm.
+    """
     entries = ALGORITHMS[algorithm].entries()
     kind: Any = dict[str, entries]  # type: ignore[valid-type]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)

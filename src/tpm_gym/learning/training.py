@@ -162,7 +162,9 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
 
 
 def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str, Any]:
-    """Apply the options of an earlier resumption that was killed before its first checkpoint.
+    """Return the configuration ``saved``, with the options of ``newest`` that resuming can change.
+
+    These options differ if an earlier resumption was killed before its first checkpoint.
 
     Args:
         saved: Configuration in the checkpoint.
@@ -174,7 +176,7 @@ def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str,
 
 @contextmanager
 def _foreign_named(run: Path) -> Iterator[None]:
-    """Raise a CheckpointError if a checkpoint has the right checksum but wrong entries."""
+    """Raise a CheckpointError if a checkpoint with the right checksum has wrong content."""
     try:
         yield
     except TPMError:

@@ -73,7 +73,7 @@ class Equations(NamedTuple):
 
 
 def get(columns: FloatArray, first: int, j: int) -> Triple:
-    """Return the entries of row j in three columns, beginning at column ``first``."""
+    """Return row j of three columns, beginning at column ``first``."""
     return columns[first, j], columns[first + 1, j], columns[first + 2, j]
 
 
@@ -194,7 +194,10 @@ def _loop(row: Callable[..., None], modes_of: Callable[..., Any], size: int, wid
 
 
 def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
-    """Return functions that need only the lengths: {function: number of result columns}."""
+    """Return the functions for the kinematics: {function: number of result columns}.
+
+    They need the lengths, but not the constants of the dynamics.
+    """
     _, lengths, _, posture, pose, position_of, regular, velocity, on_side, *_ = equations
 
     def inverse(block: _Block, j: int) -> None:
@@ -254,7 +257,10 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
 
 
 def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
-    """Return functions that need all constants: {function: number of result columns}."""
+    """Return the functions for the dynamics: {function: number of result columns}.
+
+    They need the lengths and the constants of the dynamics.
+    """
     _, lengths, inertia, _, pose, position_of, regular, velocity, _, torques, gather, masses = (
         equations
     )

@@ -193,7 +193,7 @@ class Machine(ABC):
         Args:
             position: Point P (..., 3) m.
             built: Parameters (b, k) of b machines from :meth:`built`; None for the nominal machine.
-                Of m points, point i belongs to machine ``built[i // (m // b)]``. For b machines
+                Of n points, point i belongs to machine ``built[i // (n // b)]``. For b machines
                 with q points each, pass points (b, q, 3).
         """
 

@@ -85,7 +85,7 @@ def site_names(closure: str) -> tuple[str, str]:
 
 
 def mjcf_text(machine: Machine) -> str:
-    """Write MJCF for MuJoCo without tpm_gym: the robot over a table, with servos as motors."""
+    """Return MJCF that MuJoCo can load without tpm_gym: the robot over a table, with servos."""
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))

@@ -175,7 +175,7 @@ def files(path: str | Path) -> tuple[Path, Path]:
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256, in hex, of all entries but ``sha256``; order and layout do not count."""
+    """Return the SHA-256, in hex, of a policy's JSON without ``sha256``; order does not count."""
     entries = {name: value for name, value in content.items() if name != "sha256"}
     text = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()

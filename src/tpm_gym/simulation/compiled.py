@@ -26,7 +26,7 @@ from tpm_gym.simulation.vectors import (
 
 @kept
 def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Return whether all points (m, 3) lie in the box low (3,) to high (3,); NaN is outside."""
+    """Return whether all points (n, 3) lie in the box low (3,) to high (3,); NaN is outside."""
     for row in range(len(points)):
         for axis in range(3):
             if not low[axis] <= points[row, axis] <= high[axis]:
@@ -41,8 +41,8 @@ def shifted(
     """Return points + parts * step, projected into the box from ``low`` to ``high``.
 
     Args:
-        points: (m, 3).
-        parts: (m, 3).
+        points: (n, 3).
+        parts: (n, 3).
         step: (3,).
         low: (3,).
         high: (3,).
@@ -436,7 +436,7 @@ def arrived(
     Args:
         theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
         points: (n, j, 3) m, P at the ends of the last j time steps.
-        push: (n, m, 3) N, force of the objects on P in the last m time steps.
+        push: (n, i, 3) N, force of the objects on P in the last i time steps.
         carried: (n,) kg, masses of the held objects.
         step: Time step, s.
 
@@ -489,7 +489,7 @@ def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
     """Return for each robot whether any of its torques exceeds the motor's largest torque, (r,).
 
     Args:
-        torques: (r, m, 3) N m, torques in m time steps.
+        torques: (r, k, 3) N m, torques in k time steps.
         effort: (r, 3) N m, largest torques of the motors.
     """
     found = np.zeros(len(torques), np.bool_)

@@ -28,9 +28,9 @@ It is larger than the error of single precision, 1e-6.
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
 SLOW_ABOVE = CUP.seal_gap + 0.001
-"""Height of the lip over a block, m; a gentle pick moves slowly below this height."""
+"""Height of the lip above a block, m; a gentle pick moves slowly below this height."""
 SLOW_SPEED = 0.025
-"""Speed of a gentle pick while the lip is lower than ``SLOW_ABOVE`` over the block, m/s."""
+"""Speed of a gentle pick, m/s, while the lip is less than ``SLOW_ABOVE`` above the block."""
 
 
 def hanging(block: Block) -> FloatArray:

@@ -22,7 +22,7 @@ CLEARANCE: Final = 0.045
 At this height, a carried block passes above a standing block.
 """
 APART: Final = 0.045
-"""Smallest distance between the centres of the blocks and of the goal on the table, m."""
+"""Least distance, m, between any two centres on the table: of lower block, upper block, goal."""
 CLEAR: Final = 0.0005
 """Smallest gap between the two blocks at the start, m."""
 

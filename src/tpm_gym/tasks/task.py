@@ -53,7 +53,7 @@ class Entry:
         centre: Value that is stored as 0.
         scale: Difference that is stored as 1.
         source: Function that reads values (n, ...) from a state. Adjacent entries may share it.
-        columns: The entry's columns (start, stop) of the source's result; None for all.
+        columns: Columns (start, stop) of this entry in the result of ``source``; None for all.
     """
 
     name: str
@@ -157,7 +157,7 @@ class Task(ABC):
                 raise ConfigurationError(f"{label}, scale", entry.scale, "numbers other than 0")
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
-        # The source of adjacent entries is read only once.
+        # A source that adjacent entries share is called only once.
         groups = groupby(self.entries, key=lambda entry: entry.source)
         self._sources = [(source, _columns(list(entries))) for source, entries in groups]
 
@@ -167,7 +167,7 @@ class Task(ABC):
         return {name: value for name, value in own if name not in ("entries", "_sources")}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
-        """Restore the attributes, and rebuild the entries."""
+        """Restore the attributes, and rebuild the entries of the observation vector."""
         vars(self).update(values)
         self._set_entries()
 
@@ -182,8 +182,8 @@ class Task(ABC):
         Args:
             rngs: A generator for each episode. An episode draws from its own generator only, so
                 that its values do not depend on the other episodes.
-            chosen: Entries (r, ...) that the user has chosen, within reach. They are returned
-                unchanged, and sampled entries keep clear of them.
+            chosen: Values (r, ...) by name that the user has chosen, within reach. They are
+                returned unchanged, and drawn positions keep clear of them.
 
         Returns:
             Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. With a
@@ -422,7 +422,7 @@ class Task(ABC):
     # -- observation ------------------------------------------------------------------------------
 
     def robot_entries(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, from encoders and forward kinematics."""
+        """Return the robot's entries of the observation, from encoders and forward kinematics."""
         centre, extent, speed, step = self._scales()
         measure = self._measure
         return (
@@ -434,7 +434,7 @@ class Task(ABC):
         )  # fmt: skip
 
     def object_entries(self, index: int = 0, turn: bool = False) -> tuple[Entry, ...]:
-        """Return the entries of one object, from a camera and the vacuum gauge.
+        """Return one object's entries of the observation, from a camera and the vacuum gauge.
 
         Args:
             index: Number of the object in the scene.
@@ -570,7 +570,7 @@ def _turn(index: int, state: State) -> FloatArray:
 
 
 def _columns(entries: Sequence[Entry]) -> Any:
-    """Return the index of the entries' columns in the array that their common source returns."""
+    """Return the columns of ``entries`` in the result of their common ``source``: slice or list."""
     if entries[0].columns is None:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]

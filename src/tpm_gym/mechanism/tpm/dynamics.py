@@ -21,8 +21,8 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
   rest. End link 10 can also roll about its own axis. This roll does not change the motors' torques
   and is left out.
 
-Units are SI. In the paper frame, gravity points along +z, as the base hangs upside down. Functions
-with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
+Units are SI. In the machine's frame, gravity points along +z, as the base hangs upside down.
+Functions with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class TPM(CompiledMachine):
 PAPER_TPM = TPM(
     name="paper",
     geometry=PAPER,
-    # The cup touches the table at z = 0.93 m of the paper frame, well inside the reach.
+    # The cup touches the table at z = 0.93 m of the machine's frame, well inside the reach.
     mount=Mount(height=0.97),
     # The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7.
     # Nearer to y = 0, when a random policy reverses x or z at full speed, the motors' torque cannot

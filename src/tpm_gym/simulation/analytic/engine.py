@@ -257,9 +257,11 @@ class AnalyticEngine:
         Args:
             start: (n, 3) rad, joint positions at the beginning of the control period.
             rates: (n, 3) rad/s, joint velocities at the beginning of the control period.
-            theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
+            theta: (n, k, 3) rad, joint positions at the ends of the last k of the K time steps of
+                the control period.
             path: Path of the control period.
-            push: (n, K, 3) N, force of objects on P; (n, 1, 3) zeros without objects.
+            push: (n, K, 3) N, force of objects on P in each of these K time steps; without objects,
+                (n, 1, 3) zeros.
         """
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
@@ -282,12 +284,12 @@ class AnalyticEngine:
         return over
 
     def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
-        """Compute the torques of some robots in the last m time steps, (r, m, 3) N m.
+        """Compute the torques of some robots in the last k time steps, (r, k, 3) N m.
 
         Args:
             rows: (r,) indices of the robots.
-            theta: (r, m + 2, 3) rad, joint positions at the ends of the last m + 2 time steps.
-            push: (r, K, 3) N, force of objects on P in each of K time steps; the last m are used.
+            theta: (r, k + 2, 3) rad, joint positions at the ends of the last k + 2 time steps.
+            push: (r, K, 3) N, force of objects on P in each of K time steps; the last k are used.
         """
         joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]

@@ -267,7 +267,7 @@ def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
 def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> Vector:
     """Solve mass @ u = impulse - limit * signs for u, where ``signs`` are the assumed signs of u.
 
-    If an entry of ``signs`` is 0, this entry of u is 0, and its equation is left out.
+    If a component of ``signs`` is 0, this component of u is 0, and its equation is left out.
     """
     (a, b, c, d, e, f), (p, q, r) = mass, (abs(signs[0]), abs(signs[1]), abs(signs[2]))
     own = a * p + 1 - p, b * p * q, c * p * r, d * q + 1 - q, e * q * r, f * r + 1 - r
@@ -280,7 +280,7 @@ def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> V
 def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
     """Find x from -``most`` to ``most`` that minimises x @ matrix @ x / 2 - wanted @ x.
 
-    At the minimum, some entries are at a bound, and the cost is stationary in the others.
+    At the minimum, some components of x are at a bound, and the cost is stationary in the others.
     """
     found, best = _ZERO, np.inf
     for choice in range(27):  # all combinations of no bound, upper bound and lower bound

@@ -143,7 +143,7 @@ class Friction:
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
-        """Set the scales of all faces to the values for a friction force of unknown direction."""
+        """Set the friction scales of each face to the values for a force of unknown direction."""
         self._pushes, self._lacks = {}, {}
         for face in (self._cup, *self._belts, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet

@@ -34,7 +34,11 @@ def _label(mode: kinematics.AssemblyMode | kinematics.RotatedMode) -> str:
 
 
 class TPMKind(Kind):
-    """Kind of a TPM. Its modes are WorkingModes, and AssemblyModes or RotatedModes."""
+    """Kind of a TPM.
+
+    Its working modes are WorkingModes. Its assembly modes are AssemblyModes in translating
+    operation, and RotatedModes in rotated operation.
+    """
 
     lists: Mapping[str, str] = {
         "Operation": "Link 3' only translates, or is turned about y",

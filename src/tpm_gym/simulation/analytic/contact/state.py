@@ -109,7 +109,8 @@ class Tables(NamedTuple):
         objects: (n, k) records of :data:`OBJECT`.
         cups: (n,) records of :data:`CUP_STATE`.
         forces: (n, slots(k), 3) N, contact forces of the last time step.
-        awake: (n,) whether objects or cup may still change when the lip is far from all objects.
+        awake: (n,) False if nothing changes while the lip is far from all objects: the objects are
+            at rest, the cup holds none and is not pushed in, and the vacuum is 0.
         belts: (n,) m/s, speeds of the belts along x.
     """
 
