@@ -192,7 +192,10 @@ class PolicyMismatchError(TPMError, ValueError):
 
 @dataclass(eq=False)
 class MissingPackageError(TPMError, ImportError):
-    """A required optional package is not installed; the extra ``extra`` installs it."""
+    """An optional package is needed, but is not installed.
+
+    ``extra`` names the extra of tpm-gym that installs the package.
+    """
 
     template: ClassVar[str] = (
         "this needs {package}, which cannot be imported; pip install 'tpm-gym[{extra}]'{hint}"

@@ -43,7 +43,12 @@ class Rendering:
         self.view = View(camera, int(width), int(height), segmented)
 
     def frame(self, simulation: Simulation, row: int, markers: ArrayLike) -> Any:
-        """Draw the environment ``row`` in the render mode; ``markers`` (k, 3) m mark its goals.
+        """Draw one environment in the render mode.
+
+        Args:
+            simulation: Simulation of all environments.
+            row: Index of the environment.
+            markers: Points (k, 3) m, world frame, at which the k goal markers are drawn.
 
         Raises:
             ConfigurationError: If the engine cannot draw in the render mode.
@@ -58,7 +63,7 @@ class Rendering:
 
 
 class Pixels:
-    """Pictures as observations; they replace the objects' entries of the observation vector.
+    """Pixel observations: a picture replaces the objects' values in the observation vector.
 
     Raises:
         ConfigurationError: If an option is out of range.

@@ -41,8 +41,8 @@ machine's ``safe_conditioning``."""
 TOLERANCE = 2e-5
 """Amount by which the conditioning at commands should exceed ``least``.
 
-The check of a path requires half of this amount. The other half is a reserve for errors between
-the nodes.
+The check of a path requires half of this amount. It is a reserve for errors of the check, which
+computes the conditioning at seven points of the path and interpolates between them.
 """
 _FAR = 1.05
 """If the conditioning at three successive commands is at least this multiple of ``Shield.least``,
@@ -87,9 +87,9 @@ class Shield:
     """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
     Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
-    control, increments of the joints with joint control. They are measured from the wanted command,
-    which the control computes from the action. The returned command is at most 0.003 of these
-    units farther from the wanted command than the nearest safe command is.
+    control, increments of the joints with joint control. The wanted command is the command that the
+    control computes from the action. The returned command is at most 0.003 of these units farther
+    from the wanted command than the nearest safe command is.
 
     Args:
         machine: Nominal machine.
@@ -258,15 +258,15 @@ class BrakingShield:
 def make_shield(
     shield: Any, machine: Machine, control: Control, follower: Follower | None, exact: bool
 ) -> Shield | BrakingShield:
-    """Return the shield of an environment's option.
+    """Build the shield for the option ``shield`` of an environment.
 
     Args:
         shield: The conditioning to keep, or True for the machine's ``safe_conditioning``.
         machine: Nominal machine.
         control: Control of the environment.
         follower: Limit of the control's commands, if their accelerations are bounded.
-        exact: Whether the robot follows its commands exactly. If it does not, ``shield=True`` adds
-            the fraction :data:`MARGIN` to the conditioning to keep.
+        exact: Whether the robot follows its commands exactly. If it does not, the conditioning to
+            keep with ``shield=True`` is (1 + :data:`MARGIN`) times ``safe_conditioning``.
 
     Raises:
         ConfigurationError: If the option is neither True nor a number in (0, 1], if the

@@ -278,7 +278,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """Draw the first environments side by side, as one picture.
 
         Args:
-            count: Number of environments; all of them if there are fewer.
+            count: Number of environments to draw. If there are fewer, all environments are drawn.
             columns: Pictures in each line; with None, there are about as many columns as lines.
 
         Raises:
@@ -398,10 +398,13 @@ class _Part:
     def reset(
         self, rows: IntArray, rngs: Sequence[np.random.Generator | None], options: Any
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start episodes in the environments ``rows``; return observations and infos of all.
+        """Start episodes in the environments ``rows``.
 
         ``rngs`` has an entry for each of the n environments: a new generator, or None if the
         environment keeps its generator.
+
+        Returns:
+            Observations and infos of all n environments.
         """
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
@@ -452,7 +455,16 @@ class _Part:
         return observation, reward, ended, infos
 
     def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
-        """Reset ended environments, replace their observations, and return old and new infos."""
+        """Reset the environments whose episodes ended, and return the infos of all environments.
+
+        In ``observation`` and in the returned infos, the first values of the new episodes replace
+        the last values of the ended episodes. The last values are in ``final_obs`` and
+        ``final_info`` of the returned infos.
+
+        Args:
+            observation: Observations after the last step; changed.
+            last: Infos after the last step.
+        """
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
         for row in rows.tolist():
@@ -504,7 +516,10 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
-    """Add a mask (n,) for each entry: true in ``rows``, or everywhere if ``rows`` is None."""
+    """Return ``info`` with a mask ``_key`` (count,) for each ``key``.
+
+    The mask is true in ``rows``, or everywhere if ``rows`` is None.
+    """
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
         mask[:] = False

@@ -26,7 +26,10 @@ from tpm_gym.simulation.vectors import (
 
 @kept
 def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Return whether all points (n, 3) lie in the box low (3,) to high (3,); NaN is outside."""
+    """Return whether all n points (n, 3) lie in the box from ``low`` (3,) to ``high`` (3,).
+
+    A point with NaN lies outside.
+    """
     for row in range(len(points)):
         for axis in range(3):
             if not low[axis] <= points[row, axis] <= high[axis]:
@@ -41,11 +44,11 @@ def shifted(
     """Return points + parts * step, projected into the box from ``low`` to ``high``.
 
     Args:
-        points: (n, 3).
-        parts: (n, 3).
-        step: (3,).
-        low: (3,).
-        high: (3,).
+        points: (n, 3), n points.
+        parts: (n, 3), for each point the factors of ``step`` along the three axes.
+        step: (3,), displacement along each axis for a factor of 1.
+        low: (3,), lower corner of the box.
+        high: (3,), upper corner of the box.
     """
     moved = np.empty_like(points)
     for row in range(len(points)):

@@ -39,12 +39,12 @@ from tpm_gym.simulation.state import Scene
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _NEAR_PLANE = 1.2
-"""Limit of the distance from P to the plane of symmetry normal to ``mirror_axis``, divided by the
-machine's ``step_limit`` (m) along this axis.
+"""Largest distance from the plane of symmetry at which P is near the plane.
 
-If P is farther from the plane, torques are computed from differences of joint positions. At this
-limit and at full speed, the differences give P's acceleration normal to the plane with an error of
-0.2 m/s^2.
+The plane is normal to ``mirror_axis``. The distance is given as a multiple of the machine's
+``step_limit`` (m) along this axis. If P is farther from the plane, torques are computed from
+differences of joint positions. At this distance and at full speed, the differences give P's
+acceleration normal to the plane with an error of 0.2 m/s^2.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -260,8 +260,8 @@ class AnalyticEngine:
             theta: (n, k, 3) rad, joint positions at the ends of the last k of the K time steps of
                 the control period.
             path: Path of the control period.
-            push: (n, K, 3) N, force of objects on P in each of these K time steps; without objects,
-                (n, 1, 3) zeros.
+            push: (n, K, 3) N, force of cup and objects on P in each of the K time steps of the
+                control period. If the scene has no objects, this is an array (n, 1, 3) of zeros.
         """
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
@@ -288,8 +288,9 @@ class AnalyticEngine:
 
         Args:
             rows: (r,) indices of the robots.
-            theta: (r, k + 2, 3) rad, joint positions at the ends of the last k + 2 time steps.
-            push: (r, K, 3) N, force of objects on P in each of K time steps; the last k are used.
+            theta: (r, m + 2, 3) rad, joint positions at the ends of the last m + 2 time steps.
+            push: (r, K, 3) N, force of cup and objects on P in each of K time steps; the forces in
+                the last m time steps are used.
         """
         joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]

@@ -5,8 +5,10 @@ normal force) along each of two directions. If an object slips at 45 degrees to 
 friction is sqrt(2) times too strong. At other oblique angles, friction is also not opposite to the
 slip. On a level face the directions are the world's x and y, and Bullet can scale both limits for
 each body. For a slipping contact, this module scales both limits so that a corner of the box lies
-on the cone, opposite to the slip. For a sticking contact, the limit along x follows from the cone
-and the last force along y, and vice versa. Without a last force, the box lies inside the cone.
+on the cone, opposite to the slip. For a sticking contact, the module computes the limit along x
+from the cone and the friction along y in the last time step, and the limit along y from the
+friction along x. If this friction was zero or very small, its next direction is unknown. Then the
+module chooses a box inside the cone.
 
 **Slides.** All points of a contact share these scales, and contacts between objects have no scales.
 So this module adds the friction that was missing in the last time step, as a force and a torque.
@@ -50,10 +52,10 @@ _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction o
 _BOX = (1.0, 1.0)  # Bullet's default scales
 _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
-"""Record of the friction force that was added to a contact in a time step: two entries, N.
+"""Record of the friction force that was added to a contact in a time step: a vector and a limit, N.
 
-The first entry is the steady part of the added force (see ``compiled.friction_force``). The second
-entry is the largest size of the added force that the contact forces allow.
+The vector is the steady part of the added force (see ``compiled.friction_force``). The limit is the
+largest magnitude of the added force: mu * N minus the solver's friction.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
@@ -200,7 +202,7 @@ class Friction:
                 self._scale_at(index, points, index == held)
 
     def _scale_at(self, index: int, points: Sequence[Any], held: bool) -> None:
-        """Scale the friction of an object at its contact points, and add what was missing."""
+        """Scale an object's friction at its contacts, and add friction that the solver left out."""
         (body, table, block), cup = self._bodies[index], self._cup
         rough, motion = self._factor * block.friction, self._motion(body)
         if below := [point for point in points if point[2] == table.body]:
