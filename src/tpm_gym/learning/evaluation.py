@@ -42,7 +42,7 @@ _ROWS = (
     ("return", "return", 1.0, "{:.2f}", ""),
     ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
     ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
-    ("share of steps below safe", "unsafe_share", *_SHARE),
+    ("share of steps with unsafe conditioning", "unsafe_share", *_SHARE),
     ("closure error, largest", "closure_error_max", 1e3, "{:.4f}", " mm"),
     ("observed P off, largest", "fk_error_max", 1e3, "{:.4f}", " mm"),
     ("torque, RMS", "torque_rms", 1.0, "{:.1f}", " N m"),
