@@ -22,7 +22,7 @@ CLEARANCE: Final = 0.045
 At this height, a carried block passes above a standing block.
 """
 APART: Final = 0.045
-"""Smallest distance between the centres of the blocks and of the goal on the table, m."""
+"""Smallest distance between any two of lower block, upper block and goal (their centres), m."""
 CLEAR: Final = 0.0005
 """Smallest gap between the two blocks at the start, m."""
 
