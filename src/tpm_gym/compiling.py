@@ -56,7 +56,7 @@ def kept(function: _Function) -> _Function:
 
 
 class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has no types
-    """Content of a file in Numba's cache: machine code, with the stamp of its function."""
+    """Content of a file in Numba's cache: a function's machine code and :func:`stamp` (a hash)."""
 
     stamp = ""
 

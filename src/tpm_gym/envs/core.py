@@ -52,7 +52,8 @@ INFO: Final = {
 """Type of each entry that all infos have. The events of a task are further entries."""
 
 _TAKEN: Final = ("randomisation", "final_obs", "final_info", "episode")
-"""Other names of info entries that a task must not use: this package or Gymnasium adds them."""
+"""Names of entries that this package or Gymnasium adds to some infos. No event of a task may have
+one of these names, or a name in ``INFO``."""
 
 Observation = dict[str, Any]  # arrays of float32
 Report = tuple[Observation, FloatArray, dict[str, Any]]

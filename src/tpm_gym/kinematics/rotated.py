@@ -1,4 +1,4 @@
-"""The second operation mode: link 3' and the platform turned about y, in closed form.
+"""Kinematics of the second operation mode, in which link 3' and the platform are turned about y.
 
 Seen along y, leg 1 is a four-bar linkage with opposite sides of equal length: rods 4a and 4b, and
 links 3 and 3'. In the paper's mode it is a parallelogram, in which link 3' only translates. In the
@@ -336,9 +336,9 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'.
+    """Compute cos(beta) by Eqs. (9) and (10) in the frame of link 3', and whether beta exists.
 
-    The second result tells whether rods 11a and 11b can reach link 7.
+    Beta exists if rods 11 have the length l4 for some direction of link 7.
     """
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)

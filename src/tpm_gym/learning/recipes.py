@@ -114,9 +114,9 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
     """Return the alphabetically first algorithm with a recipe for an id.
 
-    If no algorithm has a recipe for the id, return the first algorithm that has a recipe of
-    pick-and-place which the environment can use (see :func:`read_recipe`). If there is none either,
-    return ``"sac"``.
+    If no algorithm has a recipe for the id, return the first algorithm for which
+    :func:`read_recipe` returns the recipe of pick-and-place instead. If there is no such algorithm
+    either, return ``"sac"``.
 
     Args:
         env_id: ``id`` or ``module:id``.

@@ -257,7 +257,12 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Restore the unfinished episodes; refuse if they do not end in the saved observations."""
+    """Restore the unfinished episodes up to their last step.
+
+    Raises:
+        CheckpointError: If the observations after the last step differ from the saved ones, or an
+            episode cannot be repeated.
+    """
     envs: Any = model.env
     last = starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):

@@ -219,12 +219,12 @@ def distances(points: FloatArray, others: FloatArray) -> FloatArray:
 
 @kept
 def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return for each row whether any of its k places is outside its box, (n,).
+    """Return for each row whether a place of the row is outside the box for this place, (n,).
 
     A place with NaN is outside.
 
     Args:
-        places: (n, k, 3).
+        places: (n, k, 3), k places in each row. Box i is for place i of every row.
         low: (k, 3), lowest coordinates in the boxes.
         high: (k, 3), highest coordinates in the boxes.
     """
@@ -505,7 +505,7 @@ def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
 
 @kept
 def ends(theta: FloatArray, step: float) -> FloatArray:
-    """Compute the motion in the first and in the last time step of a control period.
+    """Compute the motion in the first and in the last of the K time steps of a control period.
 
     Velocities and accelerations are computed from differences of the joint positions in this
     control period only, because the acceleration jumps between control periods.

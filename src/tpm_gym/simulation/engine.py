@@ -1,8 +1,9 @@
 """Interface of engines, and the registry of engines by name.
 
 An engine simulates n robots, each over its own table. Engines know machine, scene and drive, but
-no goals, rewards or Gymnasium. Encoder errors, modes and the State are computed for all engines in
-:mod:`tpm_gym.simulation.simulation`.
+no goals, rewards or Gymnasium. For all engines, :mod:`tpm_gym.simulation.simulation` adds encoder
+errors to the readings, records the modes that robots leave, and computes the
+:class:`~tpm_gym.simulation.state.State`.
 """
 
 from __future__ import annotations
@@ -156,7 +157,7 @@ class Path:
     Args:
         machine: Nominal machine, used for the inverse kinematics.
         commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
-        weights: (K, 3), from :func:`spline_weights`.
+        weights: (K, 3), from :func:`spline_weights`, for the K time steps of the control period.
         bias: (n, 3) rad, encoder reading minus true joint position; None for zero.
 
     Methods that return joint positions raise JointLimitError if a motor would be beyond a stop, and
@@ -195,7 +196,7 @@ class Path:
         return theta if self._bias is None else self.true(theta)
 
     def readings(self) -> FloatArray:
-        """Return encoder readings (n, K + 1, 3) rad, from beginning to end of the period."""
+        """Return encoder readings (n, K + 1, 3) rad at the start and after each of K time steps."""
         return self._readings(np.concatenate([_START, self.weights]))
 
     def _readings(self, weights: FloatArray) -> FloatArray:
@@ -215,7 +216,10 @@ class Path:
 
 @cache
 def loops() -> ModuleType:
-    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, which import Numba."""
+    """Import and return :mod:`tpm_gym.simulation.compiled`, a module of compiled functions.
+
+    The module imports Numba, so it is imported only when its functions are needed.
+    """
     from tpm_gym.simulation import compiled
 
     return compiled

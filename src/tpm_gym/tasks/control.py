@@ -84,7 +84,7 @@ class CartesianControl:
         return float((np.abs(wanted - current) / self._step).max())
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide ``points`` by the step limit."""
+        """Divide the points by the step limit."""
         return points / self._step
 
     def rate(self, points: FloatArray) -> FloatArray:
@@ -184,12 +184,12 @@ class JointControl:
         return float(max(turns / self._turn, axes))
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide the joint positions at ``points`` by a joint's largest change per control step."""
+        """Compute the joint positions, divided by the joint increment of an action of 1."""
         places: FloatArray = self._machine.inverse(points) / self._turn
         return places
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Multiply J at ``points`` by a joint's largest change per control step."""
+        """Compute J, multiplied by the joint increment of an action of 1."""
         theta = self._machine.inverse(points)
         rate: FloatArray = self._machine.evaluate(theta).jacobian * self._turn
         return rate

@@ -22,7 +22,7 @@ CLEARANCE: Final = 0.045
 At this height, a carried block passes above a standing block.
 """
 APART: Final = 0.045
-"""Least distance, m, between any two centres on the table: of lower block, upper block, goal."""
+"""Smallest distance between any two of lower block, upper block and goal (their centres), m."""
 CLEAR: Final = 0.0005
 """Smallest gap between the two blocks at the start, m."""
 

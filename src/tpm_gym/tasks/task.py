@@ -182,8 +182,8 @@ class Task(ABC):
         Args:
             rngs: A generator for each episode. An episode draws from its own generator only, so
                 that its values do not depend on the other episodes.
-            chosen: Values (r, ...) by name that the user has chosen, within reach. They are
-                returned unchanged, and drawn positions keep clear of them.
+            chosen: Values by name, (r, ...) each, that the user has chosen, within reach. The
+                result contains them unchanged, and sampled positions keep clear of them.
 
         Returns:
             Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. With a
@@ -199,7 +199,7 @@ class Task(ABC):
         return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Yield the expert's moves for one robot; the expert repeats the last move.
+        """Yield the expert's moves for one robot; the last move is repeated to the episode's end.
 
         Raises:
             ConfigurationError: If the task has no plan.
@@ -241,7 +241,7 @@ class Task(ABC):
         return {"goal": goal, "singularity": singularity, **self.shaping(state)}
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the goal term (...,) for a gap (...,) m; in a sparse reward, NaN gives -1."""
+        """Return the goal term (...,) of a gap (...,) m; in a sparse reward, a NaN gap gives -1."""
         if self.reward == "sparse":
             missed: FloatArray = np.subtract(gap < self.tolerance, 1.0)
             return missed
@@ -250,11 +250,11 @@ class Task(ABC):
     def penalty(self, state: State) -> FloatArray:
         """Return the singularity penalty before weighting, (n,) in [0, 1].
 
-        It is 1 past a singularity. Else it is 1 - (c / safe)^4 where the conditioning c is below
-        ``safe``, the machine's ``safe_conditioning``, and 0 elsewhere. It is steepest at ``safe``.
-        Policies ignored an earlier penalty, a cubic function of c with slope 0 at ``safe``. SAC
-        with joint increments, on goals next to the threshold ``safe``, spent 24% of the time below
-        it without a penalty, 19% with the cubic penalty, 1% with this penalty.
+        The penalty is 1 past a singularity. Elsewhere it is 1 - (c / safe)^4 if the conditioning c
+        is below the machine's ``safe_conditioning`` (safe), else 0. It is steepest at c = safe.
+        Policies ignored an earlier penalty, a cubic function of c with slope 0 at c = safe. With
+        SAC, joint increments and tempting goals, c was below safe for 24% of the time if there was
+        no penalty, for 19% with the cubic penalty, and for 1% with this penalty.
         """
         values: FloatArray = loops().singularity_penalty(
             state.conditioning,
@@ -556,7 +556,7 @@ class Task(ABC):
         return low, high
 
     def lost(self, state: State) -> BoolArray:
-        """Return whether an object is off the table, or out of reach and beyond all goals, (n,)."""
+        """Return whether an object left the table or the area of starts, reach and goals, (n,)."""
         places = np.ascontiguousarray(state.object_position)
         lost: BoolArray = loops().any_outside(places, *self._within)
         return lost
@@ -570,7 +570,7 @@ def _turn(index: int, state: State) -> FloatArray:
 
 
 def _columns(entries: Sequence[Entry]) -> Any:
-    """Return the columns of ``entries`` in the result of their common ``source``: slice or list."""
+    """Return the NumPy index of the entries' columns in the result of the ``source`` they share."""
     if entries[0].columns is None:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]
