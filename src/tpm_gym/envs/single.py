@@ -147,7 +147,7 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``singularity_penalty`` | penalty before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
     | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
-    | ``object_lost`` | whether an object is off the table or out of reach |
+    | ``object_lost`` | whether an object left the table or the area of starts, reach and goals |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | the episode's plant; only from reset(), if this option is set |
 
