@@ -127,7 +127,7 @@ def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 _TITLES = {
     "speed": "Control steps a second, summed over the environments: "
-    "medians and quartiles of rounds.",
+    "median and quartiles of several rounds.",
     "threads": f"Control steps a second of {PICK}, summed over the environments, "
     "with one and two threads.",
     "torques": "Torques, where nothing is touched.",
