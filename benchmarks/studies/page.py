@@ -324,10 +324,9 @@ def _compared(runs: Frame) -> list[str]:
     """Return a line for each id and method: time with unsafe conditioning, by penalty."""
     shares = runs.groupby(["env", "label", "penalty_weight"])["pybullet.unsafe_share.mean"].mean()
     shares = shares.unstack().reindex(columns=[0.0, 1.0]).dropna()
-    none = "no step with unsafe conditioning."
     return [
         f"{env}, {label}: {without:.2%} without the penalty, {with_it:.3%} with it: "
-        + (f"{without / with_it:,.0f} times less." if with_it > 0 else none)
+        + (f"{without / with_it:,.0f} times less." if with_it > 0 else "never.")
         for (env, label), without, with_it in shares.itertuples()
     ]
 
