@@ -83,9 +83,10 @@ def _planar(
 
 
 def _leg1(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Return positions of C1 where leg 1 is stretched or folded.
+    """Return positions of C1 where leg 1, seen along x, is stretched or folded.
 
-    ``t`` is the angle from the arm to the rods.
+    ``t`` is the angle from the arm to the rods, in the plane that contains the arm and the
+    direction x.
     """
     square = (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     return g.l4 * np.sin(t), up * np.sqrt(np.maximum(square, 0.0)), 1.0 + 0 * t, 0.0 * t
@@ -134,14 +135,19 @@ _CURVES: dict[str, Curve] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """The n arcs of one factor.
+    """The n arcs of the curve on which point C1 lies if one factor is zero.
+
+    The points of the curve are a function of an angle and two signs. Each arc has fixed signs, and
+    its angle runs over one interval.
 
     Attributes:
-        curve: Function that gives the points.
-        first: (n,) first of the two signs for ``curve``.
-        second: (n,) second of the two signs for ``curve``.
-        middle: (n,) rad, middle of the interval of the angle.
-        half: (n,) rad, half the length of the interval.
+        curve: Function that returns points of the curve; see :data:`Curve`.
+        geometry: First argument of ``curve``, the lengths.
+        mode: Second argument of ``curve``, the working mode.
+        first: (n,) first sign of each arc, -1 or 1.
+        second: (n,) second sign of each arc, -1 or 1.
+        middle: (n,) rad, middle of the angle's interval.
+        half: (n,) rad, half the length of the angle's interval.
     """
 
     curve: Curve

@@ -103,7 +103,7 @@ def bits(value: Any) -> Any:
 
 
 def play(env: Env, actions: Iterable[Any]) -> list[Any]:
-    """Return the bits of the results of each step, and of the state after the step."""
+    """Play actions; return each step's results and the state after it, with arrays as bytes."""
     return [(bits(env.step(action)), _state_of(env)) for action in actions]
 
 

@@ -80,7 +80,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment; "the id's" below means the default of the environment id."""
+    """Options of an environment. The default "the id's" means that the environment id decides."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""

@@ -38,7 +38,7 @@ class CompiledMachine(Machine):
     geometry: Any
 
     _module: ClassVar[str]
-    """Name of the module whose LOOPS are the compiled loops."""
+    """Name of the module whose constant ``LOOPS`` contains the compiled loops over robots."""
     _inertia_of: ClassVar[Any]
     """Function (:class:`Bodies`, geometry) -> constants of the dynamics."""
 

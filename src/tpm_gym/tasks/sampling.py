@@ -214,7 +214,7 @@ def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatA
 def at_threshold(
     rng: np.random.Generator, machine: Machine, region: Region, count: int
 ) -> FloatArray:
-    """Draw points (count, 3) of a region, just above the threshold of safe conditioning.
+    """Draw points (count, 3) with a conditioning just above the safe threshold, from a region.
 
     Raises:
         ConfigurationError: If no draw was near the threshold.
@@ -228,7 +228,7 @@ def at_threshold(
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:
-    """Draw points from ``region``, and return those just above the threshold, (n, 3)."""
+    """Draw points; return those with a conditioning just above the safe threshold, (n, 3)."""
     points = rng.uniform(region.low, region.high, (_BATCH, 3))
     conditioning, (low, high) = machine.conditioning_at(points), _limits(machine, True)
     chosen: FloatArray = points[(conditioning >= low) & (conditioning < high)]

@@ -253,8 +253,8 @@ class Task(ABC):
         The penalty is 1 past a singularity. Elsewhere it is 1 - (c / safe)^4 if the conditioning c
         is below the machine's ``safe_conditioning`` (safe), else 0. It is steepest at c = safe.
         Policies ignored an earlier penalty, a cubic function of c with slope 0 at c = safe. With
-        SAC, joint increments and tempting goals, c was below safe for 24% of the time if there was
-        no penalty, for 19% with the cubic penalty, and for 1% with this penalty.
+        SAC, joint increments as actions, and goals next to a singularity, c was below safe for 24%
+        of the time without a penalty, for 19% with the cubic penalty, and for 1% with this penalty.
         """
         values: FloatArray = loops().singularity_penalty(
             state.conditioning,
@@ -358,8 +358,7 @@ class Task(ABC):
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the low and high corners (3,) m of the places where a block may start.
 
-        By default, these are all places that the robot can reach. A task with blocks that come from
-        elsewhere overrides this method.
+        The default is :meth:`reach_of`. A task with other starts overrides this method.
         """
         return self.reach_of(block)
 
@@ -556,7 +555,8 @@ class Task(ABC):
         return low, high
 
     def lost(self, state: State) -> BoolArray:
-        """Return whether an object left the table or the area of starts, reach and goals, (n,)."""
+        """Return whether an object left the table, or the box of its allowed places, (n,)."""
+        # The box is around the robot's reach, all starts and all goals.
         places = np.ascontiguousarray(state.object_position)
         lost: BoolArray = loops().any_outside(places, *self._within)
         return lost

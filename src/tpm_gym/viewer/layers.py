@@ -50,7 +50,7 @@ class Layers:
 
     Args:
         scene: Scene of a viser server.
-        kind: Kind of the machine, which computes the layers.
+        kind: The machine with its modes; this object computes what the layers show.
     """
 
     def __init__(self, scene: SceneApi, kind: Kind) -> None:
@@ -63,7 +63,7 @@ class Layers:
         """Return the available layers of a posture, by name.
 
         These are the layer "region", with the boxes of the commands and of the goals, and the
-        layers of the machine's kind.
+        layers that :meth:`Kind.layers` returns.
         """
         machine = self._kind.machine
         regions = {"region": machine.region, "goals": machine.goal_region}

@@ -94,7 +94,7 @@ def ideal_push(
     torque: FloatArray,
     behind: BoolArray,
 ) -> None:
-    """Find the torques of ideal drives from the inverse inertia, which may be singular.
+    """Find the torques of ideal drives from the inverse inertia; this matrix may be singular.
 
     Other arguments are explained in :func:`ideal_step`.
 
