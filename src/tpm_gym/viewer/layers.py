@@ -169,7 +169,7 @@ LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
         "Constraint", "Constraint singularity of the working mode, purple", Layers._singular
     ),
     "aspects": (
-        "Aspects", "Regions of the working mode without singularities, on the side of P",
+        "Aspects", "Singularity-free regions of the working mode, on the side of P",
         Layers._aspects,
     ),
     "workspace": (
@@ -179,7 +179,7 @@ LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
         "Task region", "Box of the commands (black) and of the goals (green)", Layers._region
     ),
     "conditioning": (
-        "Conditioning", "1/cond(J) in the plane of P parallel to xz, in these modes",
+        "Conditioning", "1/cond(J) in the plane of P parallel to xz, in the modes shown",
         Layers._conditioning,
     ),
     "margin": ("Margin", "Way from P to the nearest singularity", Layers._margin),
