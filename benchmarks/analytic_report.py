@@ -126,10 +126,12 @@ def _success(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 
 _TITLES = {
-    "speed": "Speed, steps of environments a second, medians and quartiles of rounds.",
-    "threads": f"Threads, {PICK}, steps of environments a second.",
-    "torques": "Torques, with free hands.",
-    "success": "Success at the end, of the same episodes.",
+    "speed": "Control steps a second, summed over the environments: "
+    "median and quartiles of several rounds.",
+    "threads": f"Control steps a second of {PICK}, summed over the environments, "
+    "with one and two threads.",
+    "torques": "Torques, where nothing is touched.",
+    "success": "Success at the end of the same episodes.",
 }
 _TABLES = {"speed": _speed, "threads": _threads, "torques": _torques, "success": _success}
 

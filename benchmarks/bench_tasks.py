@@ -33,7 +33,7 @@ ENGINES: Final = ("analytic", "pybullet", "mujoco")
 IDS: Final = {f"TPM{kind.__name__}-v0": kind for kind in TASKS.values()}
 OTHERS: Final = ({"machine": "wide"}, {"goals": "tempting"})
 SHOWN: Final = 0.0005
-"""Smallest share of steps below safe that the page shows."""
+"""Smallest share of steps with unsafe conditioning that the page shows."""
 _KEY: Final = ("env", "policy", "machine", "goals", "engine")
 
 

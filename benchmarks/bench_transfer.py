@@ -124,7 +124,7 @@ def run(cell: Cell) -> dict[str, Any]:
 def lines(record: dict[str, Any]) -> Iterator[str]:
     """Yield the table in Markdown: one row for policies of a kind, median and range over seeds."""
     command = record["machine"]["command"]
-    yield f"`{command}`, {record['episodes']} episodes a policy and cell."
+    yield f"`{command}`, {record['episodes']} episodes for each policy in each cell."
     yield ""
     columns = list(dict.fromkeys((cell["engine"], cell["drive"]) for cell in record["cells"]))
     kinds = list(dict.fromkeys(cell["kind"] for cell in record["cells"]))

@@ -252,7 +252,7 @@ def largest_aspect(machine: Machine) -> str:
 
 
 def trainings(machine: Machine, runs: Path) -> Iterator[dict[str, Any]]:
-    """Yield steps and seconds of CPU to 95%, success and time below safe of each training."""
+    """Yield steps and CPU seconds to 95%, success and unsafe share of steps of each training."""
     if machine is PAPER_TPM:
         for path in sorted((DOCS / "results").glob(f"{RUNS}-s?.json")):
             record = json.loads(path.read_text(encoding="utf-8"))
@@ -368,7 +368,7 @@ LEARNING = (
     "steps to 95%, median",
     "seconds of CPU to 95%, median",
     "success in PyBullet, median (range), %",
-    "time below safe, mean, %",
+    "time with unsafe conditioning, mean, %",
 )
 
 

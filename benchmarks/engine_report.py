@@ -66,7 +66,8 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
     yield _costs(record)
     yield ""
     if "renewed" in record:
-        yield f"These parts were measured again later: `{record['renewed']['command']}`."
+        command = record["renewed"]["command"]
+        yield f"The parts named in this command were measured again later: `{command}`."
         yield ""
     heads = list(dict.fromkeys((row["engine"], row["drive"]) for row in record["matrix"]))
     yield from table(

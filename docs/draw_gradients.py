@@ -54,7 +54,7 @@ def report(record: dict[str, Any]) -> str:
     """Return the tables of docs/gradients.md."""
     lines = [
         "| lengths (mm) | l1 | l2 | l3 | l4 | l5 | l6 | l7 | box (mm) | litres |",
-        "| --- " * 10 + "|",
+        "|---" * 10 + "|",
     ]
     for name, design in record["designs"].items():
         size = np.subtract(design["high"], design["low"])
@@ -65,7 +65,7 @@ def report(record: dict[str, Any]) -> str:
     lines += [
         f"\nLitres that the searches found: {volumes}.\n",
         "| machine | time (s) | weight | expert | least | heat | peaks | PyBullet | heat |",
-        "| --- " * 9 + "|",
+        "|---" * 9 + "|",
     ]
     for row in record["carries"]:
         expert, found = row["expert"], row["found"]

@@ -15,7 +15,7 @@ _ELEVATION = np.deg2rad(20.0)  # of the eye
 
 @dataclass(frozen=True)
 class Skeleton:
-    """The paper's named points, each (..., 3) m in the paper frame; NaN where not reachable.
+    """The paper's named points, each (..., 3) m in the paper's frame; NaN where not reachable.
 
     Attributes:
         a: A1, A2, A3 (3, 3), the actuated pivots.

@@ -77,7 +77,7 @@ def sweep_leg3(line: FloatArray, y0: float, y: FloatArray) -> FloatArray:
 
 
 def trimmed(mesh: FloatArray, keep: Callable[[FloatArray], BoolArray]) -> FloatArray:
-    """Return cells (k, 4, 3) of a mesh (m, n, 3) where ``keep``; cells on its edge are divided."""
+    """Return cells (k, 4, 3) of a mesh (i, j, 3) where ``keep``; cells on its edge are divided."""
     inside = keep(mesh)
     count = sum(
         inside[i : len(mesh) - 1 + i, j : mesh.shape[1] - 1 + j] for i in (0, 1) for j in (0, 1)

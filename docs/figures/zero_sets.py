@@ -38,7 +38,7 @@ class Section:
     at: float
 
     def points(self, plane: FloatArray) -> FloatArray:
-        """Return points (..., 3) m in the paper frame from section coordinates (..., 2) m."""
+        """Return points (..., 3) m in the paper's frame from section coordinates (..., 2) m."""
         x, other = plane[..., 0], plane[..., 1]
         fixed = np.full_like(x, self.at)
         yz = (fixed, other) if self.fixed == "y" else (other, fixed)
@@ -87,7 +87,7 @@ def reach_margin(points: FloatArray, cos_beta_sign: int, geometry: Geometry = PA
 
 
 def zero_lines(field: Field, u: FloatArray, v: FloatArray) -> list[FloatArray]:
-    """Find lines (n, 2) on which ``field`` changes sign, over the grid u (m,) by v (k,).
+    """Find lines (n, 2) on which ``field`` changes sign, over the grid u (j,) by v (k,).
 
     Args:
         field: Values (...,) at section coordinates (..., 2); NaN where it does not exist.

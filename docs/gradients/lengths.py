@@ -43,7 +43,7 @@ _BOX = torch.arange(7, 13)
 
 
 class Design(NamedTuple):
-    """Lengths, and the largest box that was found for them (paper frame)."""
+    """Lengths, and the largest box that was found for them (paper's frame)."""
 
     geometry: Geometry
     box: Region

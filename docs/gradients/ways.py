@@ -65,11 +65,11 @@ class Carry:
         return torch.tensor(np.array([*commands, self.last]))
 
     def joints(self, commands: Tensor) -> Tensor:
-        """Compute joint angles at the time steps of the engines, with both ends, (m, 3) rad."""
+        """Compute joint angles at the time steps of the engines, with both ends, (n, 3) rad."""
         return inverse(points(commands), self.machine.working_mode, self.machine.geometry)
 
     def torque(self, commands: Tensor) -> Tensor:
-        """Compute the motors' torques (m - 2, 3) N m, at the time steps between."""
+        """Compute the motors' torques (n - 2, 3) N m, at the time steps between."""
         theta, period = self.joints(commands), CONTROL_PERIOD / _SUBSTEPS
         rate = (theta[2:] - theta[:-2]) / (2 * period)
         change = (theta[2:] - 2 * theta[1:-1] + theta[:-2]) / period**2

@@ -87,7 +87,9 @@ def is_whole(value: Any, least: int) -> bool:
 
 
 def points(name: str, value: ArrayLike) -> FloatArray:
-    """Return points (..., 3), finite or not; a torch tensor stays one, on its device, in float64.
+    """Return points (..., 3), finite or not, in float64.
+
+    A torch tensor remains a torch tensor, on the same device.
 
     Raises:
         InputError: If they are no real numbers or the last axis does not have length 3.

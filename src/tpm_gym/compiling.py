@@ -47,8 +47,8 @@ def compiled(function: _Function) -> _Function:
 def kept(function: _Function) -> _Function:
     """Compile a function as :func:`compiled` does, and keep its machine code on disk.
 
-    It is compiled again if any source that is compiled into it has changed, or if the file on disk
-    is damaged. If no folder can be written, it is compiled in memory.
+    It is compiled again if any source code that goes into it has changed, or if the file on disk is
+    damaged. If no folder can be written, it is compiled in memory.
     """
     dispatcher: Any = compiled(function)
     dispatcher._cache = _Cache(function)
@@ -56,7 +56,7 @@ def kept(function: _Function) -> _Function:
 
 
 class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has no types
-    """Content of a file in Numba's cache: machine code, with the stamp of its function."""
+    """Content of a file in Numba's cache: a function's machine code and :func:`stamp` (a hash)."""
 
     stamp = ""
 
@@ -65,7 +65,7 @@ class _Code(_CACHING.CompileResultCacheImpl):  # type: ignore[misc]  # Numba has
         return self.stamp, super().reduce(cres)
 
     def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Return the machine code; None if its sources have changed since it was compiled.
+        """Return the machine code; None if its source code has changed since it was compiled.
 
         Numba writes a new index first, then the new code. In between, the new index points to the
         old code. This remains so if the process is killed in between.
@@ -78,7 +78,7 @@ class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
     """Numba's files, found by stamp, signature and processor.
 
     Numba itself also compares a pickle of the function's closure. This class does not: the pickle
-    differs between a process that reads the source and one that reads its bytecode. The stamp
+    differs between a process that reads the source code and one that reads its bytecode. The stamp
     covers the closure.
     """
 
@@ -93,7 +93,7 @@ class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
 
 
 class _Cache:
-    """Cache of a function's machine code, renewed if any of its sources changes; never raises."""
+    """Cache of a function's machine code, renewed if its source code changes; never raises."""
 
     _announced = False
 
@@ -152,11 +152,11 @@ class _Cache:
 
 _CONSTANTS = (int, float, complex, str, np.generic, np.dtype, numba.types.Number)
 _LIBRARIES: Final = {"numba", "numpy", *sys.stdlib_module_names}
-"""Packages whose functions :func:`stamp` includes by name only; it does not read their sources."""
+"""Packages from which :func:`stamp` includes only the names of functions, not their sources."""
 
 
 def stamp(function: Callable[..., Any]) -> str:
-    """Compute a hash of all that is compiled into a function: code, sources and constants."""
+    """Compute a hash of all that is compiled into a function: bytecode, source code, constants."""
     # This file is included because it has the options of Numba.
     return hashlib.sha256("\n".join([_text(__file__), *_parts(function, {})]).encode()).hexdigest()
 
@@ -189,7 +189,7 @@ def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
 
 
 def _sources(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield the source of a function, class or module, then text about everything that it uses.
+    """Yield the source code of a function, class or module, then text about all that it uses.
 
     A function's bytecode is included, because its file may have been edited since the import.
     """

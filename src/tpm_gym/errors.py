@@ -21,9 +21,10 @@ def brief(value: Any) -> Any:
 
 
 class TPMError(Exception):
-    """Root of all errors raised by tpm_gym. They survive pickling, as between worker processes.
+    """Base class of all errors raised by tpm_gym.
 
-    Errors with values are dataclasses; :attr:`template` formats the values as a message.
+    The errors can be pickled, for example to pass them between processes. Errors with values are
+    dataclasses; :attr:`template` formats the values as a message.
     """
 
     template: ClassVar[str] = ""
@@ -191,7 +192,10 @@ class PolicyMismatchError(TPMError, ValueError):
 
 @dataclass(eq=False)
 class MissingPackageError(TPMError, ImportError):
-    """A required optional package is not installed; the extra ``extra`` installs it."""
+    """An optional package is needed, but is not installed.
+
+    ``extra`` names the extra of tpm-gym that installs the package.
+    """
 
     template: ClassVar[str] = (
         "this needs {package}, which cannot be imported; pip install 'tpm-gym[{extra}]'{hint}"

@@ -42,7 +42,8 @@ def test_what_the_penalty_does_is_as_measured():
         re.MULTILINE,
     )
     without, with_it = np.array(lines, dtype=float).T
-    told = "of their time below 0.08, depending on the id. With the penalty they spend at most"
+    told = "of their steps at a conditioning below 0.08, depending on the id. Policies trained"
+    told += " with the penalty spend at most"
     page = " ".join((ROOT / "docs/environments.md").read_text(encoding="utf-8").split())
     low, high, most = re.search(rf"(\d+) to (\d+)% {told} ([\d.]+)%", page).groups()
     assert len(lines) == 4

@@ -2,10 +2,10 @@
 
 The platform can move between two points of one aspect without a singularity (Wenger and Chablat).
 Between two aspects of one working mode, every path passes a singularity. Sets are grids of cells in
-the paper frame, in metres. The singular planes y = 0 and |y| = l7 are faces of cells, so that only
-curved surfaces run through cells. All factors of :mod:`tpm_gym.analysis.singularity` count. Other
-limits, such as the stops of the motors, count only if they are given
-(:mod:`tpm_gym.analysis.limits`).
+the paper's frame, in metres. The singular planes y = 0 and |y| = l7 are faces of cells, so only
+curved surfaces run through cells. All factors of :mod:`tpm_gym.analysis.singularity` are taken
+into account. Other limits, such as the stops of the motors, are taken into account only if they are
+given (:mod:`tpm_gym.analysis.limits`).
 """
 
 import math
@@ -25,7 +25,7 @@ from tpm_gym.kinematics.workspace import Region, conditioning_at
 Shape = tuple[int, int, int]
 
 DEFAULT_SHAPE: Shape = (64, 16, 96)
-"""Numbers of cells along x, y, z; for the paper's lengths, cells of about 27 x 6 x 24 mm."""
+"""Numbers of cells along x, y, z. With the paper's lengths, a cell is about 27 x 6 x 24 mm."""
 _BITS = (1, 2, 4, 8)
 
 
@@ -89,7 +89,13 @@ class Aspect:
 
 @dataclass(frozen=True)
 class Box:
-    """Result of :func:`largest_box`, with volume in m^3 and smallest 1/cond(J) at its nodes."""
+    """Result of :func:`largest_box`.
+
+    Attributes:
+        region: The box. Its corners are centres of cells.
+        volume: Volume of the box, m^3.
+        conditioning: Smallest 1/cond(J) at the centres of the cells in the box.
+    """
 
     region: Region
     volume: float
@@ -130,7 +136,7 @@ def aspects(
     Two cells belong to one aspect if they share a face and all factors have the same signs at their
     centres. So a neck narrower than a cell divides an aspect, and a singular wall thinner than a
     cell may be missed: compare two grids. Points that ``limits`` forbid divide aspects too. Regions
-    of fewer than ``min_cells`` cells, fragments along curved boundaries, are left out.
+    of fewer than ``min_cells`` cells are left out: they are fragments along curved boundaries.
 
     Raises:
         ConfigurationError: The shape is not possible, or min_cells is not positive.
@@ -147,13 +153,17 @@ def aspects(
 def regions(
     low: Vector, spacing: Vector, codes: IntArray, min_cells: int
 ) -> Iterator[tuple[int, Cells]]:
-    """Yield code and cells of the connected regions of equal code, the largest first.
+    """Find the connected regions of cells with equal codes, and yield the largest region first.
 
     Args:
         low: Corner of the grid with the smallest x, y, z, m.
         spacing: Edges of a cell, m.
-        codes: (nx, ny, nz); negative for cells of no region.
+        codes: (nx, ny, nz) code of each cell, such as the signs of its factors as bits; negative
+            for cells that belong to no region.
         min_cells: Fewest cells of a region.
+
+    Yields:
+        The code and the cells of a region.
 
     Raises:
         ConfigurationError: min_cells is no positive whole number.
@@ -271,11 +281,15 @@ def _signs(
 _NEIGHBOURS = [
     tuple((slice(None),) * axis + (part,) for part in (slice(None, -1), slice(1, None)))
     for axis in range(3)
-]  # for each axis, two views of a grid whose entries share a face
+]  # for each axis, two views of a grid; cells at equal indices share a face
 
 
 def components(codes: IntArray) -> IntArray:
-    """Label the connected sets of equal codes, by union-find on all faces at once."""
+    """Label the connected sets of cells with equal codes.
+
+    Two cells are connected if they have a common face and equal codes. The method is union-find,
+    applied to all such pairs of cells at once.
+    """
     parent = np.arange(codes.size)
     index = parent.reshape(codes.shape)
     joined = [(a, b, codes[a] == codes[b]) for a, b in _NEIGHBOURS]

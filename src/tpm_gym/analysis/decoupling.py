@@ -47,10 +47,10 @@ class Index:
 def shares(velocity: ArrayLike) -> FloatArray:
     """Compute the share of each motor in the motion of each coordinate, (..., 3, 3), in [0, 1].
 
-    The share is J_ij^2 / sum_j J_ij^2 of the velocity Jacobian (..., 3, 3) of any mechanism whose
-    motors have the same unit. If the speeds of the motors are independent and have equal variances,
-    motor j causes this share of the variance of the speed of coordinate i. Rows add up to 1. The
-    row of a coordinate that cannot move is NaN.
+    The share is J_ij^2 / sum_j J_ij^2, where J is the argument ``velocity``, the velocity Jacobian
+    (..., 3, 3) of any mechanism whose joint positions all have the same unit. If the speeds of the
+    motors are independent and have equal variances, motor j causes this share of the variance of
+    the speed of coordinate i. Rows add up to 1. The row of a coordinate that cannot move is NaN.
     """
     squares = finite_points("velocity", velocity) ** 2
     with np.errstate(invalid="ignore"):

@@ -10,8 +10,8 @@ passes through the base point o' of the end link.
 Subspaces replace the paper's symbols for directions. Choose the base point so that no element of a
 set depends on the others: the paper writes dependent elements in braces, and this module cannot
 mark them. The sets are exact for chains that translate and rotate independently, as all chains of
-this mechanism do. They describe one configuration. Dimensions can change at a singularity;
-elsewhere they are the full-cycle values of the paper.
+this mechanism do. The sets describe one configuration. The dimensions in the paper hold for all
+configurations except singularities, where the dimension of a set can be different.
 """
 
 from __future__ import annotations
@@ -194,14 +194,17 @@ class Chain:
 
 
 def serial(sets: Sequence[POCSet]) -> POCSet:
-    """Return the POC set of a serial chain: the union of one set or more, Eq. (1)."""
+    """Return the POC set of a serial chain: the union of one or more sets, Eq. (1)."""
     if not sets:
         raise InputError("sets", sets, "at least one POC set")
     return reduce(POCSet.__or__, sets)
 
 
 def parallel(sets: Sequence[POCSet]) -> POCSet:
-    """Return the POC set of a link on one chain or more: their intersection, Eq. (2)."""
+    """Return the POC set of a link at the end of one or more chains, Eq. (2).
+
+    The set is the intersection of ``sets``, the POC sets of the chains.
+    """
     if not sets:
         raise InputError("sets", sets, "at least one POC set")
     return reduce(POCSet.__and__, sets)
@@ -292,7 +295,7 @@ class ParallelMechanism:
 
 
 def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
-    """Apply Eqs. (1) to (5) to two chains or more from the base to one platform.
+    """Apply Eqs. (1) to (5) to two or more chains from the base to one platform.
 
     Args:
         chains: Chains at one configuration.

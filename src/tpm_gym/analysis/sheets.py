@@ -1,10 +1,11 @@
-"""Singular surfaces, each swept by link 7 along a curve of C1, and the nearest points on them.
+"""Singular surfaces, and the nearest points on them.
 
-The singularity factors level3, planar, leg 1, leg 2 and elevation depend on xC and zC alone. So
-each factor is zero if C1 is on a curve in the plane y = 0. For each point of the curve, P is on a
-circle of radius l7 about (xC + l2, 0, zC + 2 l6), parallel to xy. Each curve is a closed-form
-function of one angle, so the distance to a surface is a minimum over one angle. A curve consists of
-arcs, one for each interval of the angle in which the curve is real.
+Point C1 = (xC, 0, zC) is always in the plane y = 0. Each of the singularity factors level3, planar,
+leg1, leg2 and elevation is zero only if C1 is on certain curves in this plane. For each position of
+C1, P is on a circle of radius l7 about (xC + l2, 0, zC + 2 l6), parallel to the plane xy. While C1
+follows a curve, this circle sweeps the singular surface. Each curve is a closed-form function of
+one angle, so the nearest point of a surface is found by a search over this angle. A curve consists
+of arcs, one for each interval of the angle in which the curve is real.
 """
 
 from __future__ import annotations
@@ -22,21 +23,21 @@ from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.modes import WorkingMode
 
 Point = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""xC and zC in m, and two numbers p and q, which the curve computes for its working mode. P belongs
-to the working mode if p + q cos(beta) > 0 and cos(beta) has the sign ``cos_beta`` of the mode."""
+"""xC and zC in m, and two numbers p and q, which depend on the working mode. P belongs to this
+mode if p + q cos(beta) > 0 and cos(beta) has the sign ``cos_beta`` of the mode."""
 Curve = Callable[[Geometry, WorkingMode, FloatArray, FloatArray, FloatArray], Point]
-"""Function that returns points of a curve. Its arguments are the lengths, the working mode, the
-angle, and two signs that select a branch of the curve."""
+"""Function that returns points of a curve, with p and q. Its arguments are the lengths, the working
+mode, the angle, and two signs that select a branch of the curve."""
 
 _CELLS = 256  # cells of an arc: equal steps of the ``t`` of _Arcs.at()
 _FINE = 4 * _CELLS  # chords that measure the length of an arc
 _NODES, _ROUNDS = 9, 16  # each round keeps a quarter of the interval
-_GRID = 2048  # cells of a full turn in the search for intervals
+_GRID = 2048  # steps between the sampled angles of a full turn, in the search for intervals
 _BLOCK = 64  # points at a time
 
 
 def _level3(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Return points of the two circles on which rod 11, seen along z, is parallel to link 7."""
+    """Return positions of C1, on two circles, where rod 11, seen along z, is parallel to link 7."""
     cos, sin = np.cos(t), np.sin(t)
     rise = up * np.sqrt(max(g.l4**2 - g.l7**2, 0.0))
     x, z = g.l1 - 2 * g.l2 + g.l3 * cos, g.l3 * sin - g.l6 + rise
@@ -52,12 +53,14 @@ def _rod_4(g: Geometry, theta_1: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _tangent(
     g: Geometry, t: FloatArray, side: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return x, z and length of the vector A2B1, and the coordinate of B2 along rod 6, m.
+    """Return x, z and length of the vector from A2 to B1, and the position of B2 on a line, m.
 
-    The coordinate is measured from B1, and is never positive. All values are for a view along y at
-    theta_1 = ``t``. Leg 2, with A2, is shifted so that C2 is at C1. If the planar factor is zero,
-    rods 4 and 6 then lie on one line, and the coordinate's absolute value is the distance from B1
-    to B2 in the triangle A2B1B2. ``side`` is -1 if the rods point in opposite directions, else 1.
+    Here A2, B2 and C2 are the points of leg 2 after a shift by 2 l5 along x, so that C2 coincides
+    with C1. All points are projected on the plane y = 0, and theta_1 is ``t``. If the planar factor
+    is zero, rods 4 and 6 lie on one line after the shift. The position on this line is 0 at B1 and
+    increases from B2 to C2. The position of B2 is never positive. Its absolute value is the
+    distance from B1 to B2, a side of the triangle A2B1B2. ``side`` is -1 if the rods point in
+    opposite directions, else 1.
     """
     level, up = g.l1 - 2 * g.l5 + 0 * t, g.l3 * np.sin(t)
     rod = side * np.sqrt(np.maximum(_rod_4(g, t)[1], 0.0))
@@ -67,7 +70,7 @@ def _tangent(
 def _planar(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, bend: FloatArray
 ) -> Point:
-    """Return points at theta_1 = ``t`` where rods 4 and 6, seen along y, are parallel."""
+    """Return positions of C1 at theta_1 = ``t`` where rods 4 and 6, seen along y, are parallel."""
     level, up, apart, gap = _tangent(g, t, side)
     with np.errstate(divide="ignore", invalid="ignore"):
         cosine = (g.l3**2 - gap**2 - apart**2) / (2 * gap * apart)
@@ -80,13 +83,20 @@ def _planar(
 
 
 def _leg1(g: Geometry, mode: WorkingMode, t: FloatArray, up: FloatArray, _: FloatArray) -> Point:
-    """Return points where leg 1 is stretched or folded; ``t`` is the angle from arm to rods."""
+    """Return positions of C1 where leg 1, seen along x, is stretched or folded.
+
+    ``t`` is the angle from the arm to the rods, in the plane that contains the arm and the
+    direction x.
+    """
     square = (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     return g.l4 * np.sin(t), up * np.sqrt(np.maximum(square, 0.0)), 1.0 + 0 * t, 0.0 * t
 
 
 def _leg2(g: Geometry, mode: WorkingMode, t: FloatArray, far: FloatArray, _: FloatArray) -> Point:
-    """Return points where leg 2 is stretched or folded: circles about A2 + (2 l5, 0, 0)."""
+    """Return positions of C1 where leg 2 is stretched or folded.
+
+    These positions are circles about A2 + (2 l5, 0, 0).
+    """
     radius = np.abs(g.l4 + far * g.l3)
     x, z = radius * np.cos(t) + 2 * g.l5 - g.l1, radius * np.sin(t)
     return x, z, 1.0 + 0 * t, 0.0 * t
@@ -95,7 +105,7 @@ def _leg2(g: Geometry, mode: WorkingMode, t: FloatArray, far: FloatArray, _: Flo
 def _elevation(
     g: Geometry, mode: WorkingMode, t: FloatArray, side: FloatArray, _: FloatArray
 ) -> Point:
-    """Return points at theta_1 = ``t`` where C1 is as high as B1."""
+    """Return positions of C1 at theta_1 = ``t`` that are as high as B1."""
     y, square = _rod_4(g, t)
     x, sin = side * np.sqrt(np.maximum(square, 0.0)), np.sin(t)
     return x, g.l3 * sin, mode.leg1 * y * sin, 0.0 * t
@@ -125,14 +135,19 @@ _CURVES: dict[str, Curve] = {
 
 @dataclass(frozen=True)
 class _Arcs:
-    """The n arcs of one factor.
+    """The n arcs of the curve on which point C1 lies if one factor is zero.
+
+    The points of the curve are a function of an angle and two signs. Each arc has fixed signs, and
+    its angle runs over one interval.
 
     Attributes:
-        curve: Function that gives the points.
-        first: (n,) first of the two signs for ``curve``.
-        second: (n,) second of the two signs for ``curve``.
-        middle: (n,) rad, middle of the interval of the angle.
-        half: (n,) rad, half the length of the interval.
+        curve: Function that returns points of the curve; see :data:`Curve`.
+        geometry: First argument of ``curve``, the lengths.
+        mode: Second argument of ``curve``, the working mode.
+        first: (n,) first sign of each arc, -1 or 1.
+        second: (n,) second sign of each arc, -1 or 1.
+        middle: (n,) rad, middle of the angle's interval.
+        half: (n,) rad, half the length of the angle's interval.
     """
 
     curve: Curve
@@ -182,7 +197,9 @@ def _arcs(geometry: Geometry, mode: WorkingMode, factor: str) -> tuple[_Arcs, Po
 
 
 def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
-    """Return the curves of point C1 on which a singular factor is zero: k of 256 steps, (k, 257).
+    """Return the k curves of point C1 on which a singular factor can be zero.
+
+    Each curve is divided into 256 steps, so the arrays of points are (k, 257).
 
     Args:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
@@ -198,9 +215,10 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
 
 
 def _intervals(real: Callable[[FloatArray], FloatArray]) -> list[tuple[float, float]]:
-    """Return the intervals of the angle, from 0 to 2 pi, in which a function is positive.
+    """Return the intervals of an angle, from 0 to 2 pi, in which the function ``real`` is positive.
 
-    Intervals shorter than a cell of the search are found too.
+    The function is computed at equally spaced angles. Intervals shorter than the distance between
+    two of these angles are found too.
     """
     t = np.linspace(0.0, 2 * np.pi, _GRID + 1)
     values = real(t)
@@ -225,7 +243,8 @@ def _zoom(
 ) -> FloatArray:
     """Return the arguments (n,) at which n functions are smallest, between ``low`` and ``high``.
 
-    ``function`` converts arguments (n, nodes), a row for each function, to values (n, nodes).
+    ``function`` computes all n functions together. Row i of its argument (n, m) has m arguments of
+    function i. Row i of its result (n, m) has the m values of this function.
     """
     steps, rows = np.linspace(0, 1, _NODES), np.arange(len(low))
     found = low
@@ -245,8 +264,8 @@ def nearest(
 
     Args:
         points: (n, 3) m, 0 <= y <= l7.
-        limit: (n,) m, at most the distance to the planes y = 0, |y| = l7 and to the boundary of
-            leg 3.
+        limit: (n,) m, at most the distance to the planes y = 0 and |y| = l7, and to the boundary
+            of leg 3's reach.
         mode: The working mode.
         geometry: Link lengths.
 
@@ -280,18 +299,22 @@ def _feet(
     link3 = points - [g.l2, 0, 2 * g.l6]  # C1 if link 7 had length 0
 
     def offset(rows: FloatArray, x: FloatArray, z: FloatArray) -> tuple[FloatArray, ...]:
-        """Return three distances of the points ``rows`` (..., 3) m from circles, m.
+        """Return three lengths, m, that locate the points ``rows`` (..., 3) m relative to circles.
 
-        The circles have the centres (x, 0, z) and the radius l7, and are parallel to xy. The
-        distances are: from the circle; from its centre, along x and with sign; from its centre, in
-        a projection on xy.
+        The circles have the centres (x, 0, z) and the radius l7, and are parallel to the plane xy.
+        The first result is the distance from the circle to the point. The second result is x of
+        the point minus x of the centre. The third result is the distance from the centre to the
+        point in the projection on the plane xy.
         """
         level = rows[..., 0] - x
         radius = np.hypot(level, rows[..., 1])
         return np.hypot(radius - g.l7, rows[..., 2] - z), level, radius
 
     def belongs(point: Point, level: FloatArray, radius: FloatArray) -> BoolArray:
-        """Return whether points of a curve belong to the working mode."""
+        """Return whether points of a curve belong to the working mode.
+
+        ``level`` and ``radius`` are the second and third result of offset().
+        """
         ours: BoolArray = (point[2] * radius + point[3] * level > 0) & (mode.cos_beta * level > 0)
         return ours
 
@@ -305,9 +328,11 @@ def _feet(
     low, all_ = cell.astype(np.float64) * step, np.arange(len(cell))
 
     def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
-        """Return points of k cells, and the results of offset() and belongs() for these points.
+        """Return points on k arcs, and the results of offset() and belongs() for these points.
 
-        ``cells`` (k,) are indices of ``cell``, and ``t`` (k, ...) is as in :meth:`_Arcs.at`.
+        Entry i of ``row``, ``arc`` and ``cell`` is one search: for the nearest point to the point
+        ``row[i]``, in cell ``cell[i]`` of arc ``arc[i]``. ``cells`` (k,) are indices i of searches.
+        ``t`` (k, ...) is as in :meth:`_Arcs.at`.
         """
         point, rows = arcs.at(arc[cells], t), link3[row[cells]]
         found = offset(rows[:, None] if t.ndim > 1 else rows, *point[:2])

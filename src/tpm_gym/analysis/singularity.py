@@ -3,8 +3,8 @@
 A configuration is singular where one of eight factors is zero. Three parallel factors make up
 det A and four serial factors make up det B (Eqs. 16 and 17, corrected). The eighth factor is the
 elevation z_C1 - z_B1 of rods 4. If the elevation is zero, nothing keeps link 3' from turning about
-y. The paper does not have this constraint singularity. All values are in the paper frame, in m and
-rad.
+y. The paper does not have this constraint singularity. All values are in the paper's frame, in m
+and rad.
 
 Functions of angles or points take arrays (..., 3) of numbers and raise InputError for anything
 else. The functions that classify also raise InputError for numbers that are not finite,
@@ -43,7 +43,10 @@ _SIN_BETA, _PLANAR, _COS_BETA, _LEG3 = map(
 
 
 class SingularityType(IntFlag):
-    """Kinds of Gosselin and Angeles (1990), and constraint singularities, as flags."""
+    """Kinds of singularities, as flags.
+
+    SERIAL, PARALLEL and BOTH are the kinds of Gosselin and Angeles (1990).
+    """
 
     NONE = 0
     SERIAL = 1
@@ -170,9 +173,10 @@ def _classify(values: Factors, geometry: Geometry, tolerance: float) -> Classifi
 
 
 def _edges(points: FloatArray, geometry: Geometry) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Find the nearest of the planes y = 0 and y = l7 and the torus that leg 3 can reach.
+    """Find the nearest of three surfaces: the planes y = 0 and y = l7, and leg 3's torus.
 
-    Return the distance, the nearest point on that surface, and the index of the surface's factor.
+    The torus is the boundary of leg 3's reach. Return the distance to the nearest surface, the
+    nearest point on this surface, and the index of the factor that is zero on this surface.
     """
     centre = np.array([geometry.l1 - geometry.l2, 0.0, geometry.l6])
     offset = points - centre

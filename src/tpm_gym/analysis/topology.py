@@ -3,13 +3,13 @@
 Two independent counts of the degrees of freedom start from the axes of the joints:
 
 * :func:`analyse` applies Eqs. (1) to (5) to branches I, II, III and the pair R12, R13.
-* :func:`mobility` computes the rank of the closure Jacobian of the mechanism that engines load,
-  with all rods and balls of the parallelograms.
+* :func:`mobility` computes the rank of the closure Jacobian. It uses the mechanism that PyBullet
+  and MuJoCo load, with all rods and ball joints of the parallelograms.
 
 The counts agree at singularities too. If z_C1 = z_B1, both counts are 4 instantaneous freedoms,
-because link 3' can begin to turn about y. Vectors are in the paper frame. Functions of joint angles
-take three finite numbers and raise InputError for anything else. They raise UnreachableError if the
-assembly mode does not exist at these angles.
+because link 3' can begin to turn about y. Vectors are in the paper's frame. Functions of joint
+angles take three finite numbers and raise InputError for anything else. They raise UnreachableError
+if the assembly mode does not exist at these angles.
 """
 
 from collections.abc import Mapping
@@ -47,7 +47,10 @@ class Structure:
 
     @property
     def chains(self) -> tuple[Chain, Chain, Chain]:
-        """Chains from the base to link 3': I, II, and III with the wrist reversed."""
+        """Chains from the base to link 3'.
+
+        The first two are branches I and II. The third is branch III, followed by R13 and R12.
+        """
         first, second, third = self.branches
         return first, second, Chain("III, wrist", (*third.units, *self.wrist.units[::-1]))
 
@@ -100,7 +103,7 @@ class Topology(poc.ParallelMechanism):
     """Result of :func:`analyse`.
 
     The first entry of ``decompositions`` is the paper's: the first loop consists of branches I and
-    II, and branch III with the wrist closes the second loop.
+    II, and branch III with R12 and R13 closes the second loop.
 
     Attributes:
         sub_mechanism: POC set of link 3' on branches I and II. The paper calls it M_Pa(1-2), in the

@@ -49,10 +49,11 @@ INFO: Final = {
     "object_lost": bool,
     "reward_terms": dict,
 }
-"""Types of the entries of every info by name; the task's events are further entries."""
+"""Type of each entry that all infos have. The events of a task are further entries."""
 
 _TAKEN: Final = ("randomisation", "final_obs", "final_info", "episode")
-"""Other names of info entries that a task must not use: this package or Gymnasium adds them."""
+"""Names of entries that this package or Gymnasium adds to some infos. No event of a task may have
+one of these names, or a name in ``INFO``."""
 
 Observation = dict[str, Any]  # arrays of float32
 Report = tuple[Observation, FloatArray, dict[str, Any]]
@@ -64,11 +65,12 @@ class EnvSnapshot:
     """Everything that the next steps of n environments depend on.
 
     Attributes:
-        kind: Task and options. Environments with other values cannot restore the snapshot.
-        simulation: The simulation's part.
-        rngs: States of the n generators, with their seeds.
-        columns: Arrays by name: goals and delayed actions. Vector environments add the lengths
-            and ends of their episodes.
+        kind: Task and options. Environments with another task or with other options cannot restore
+            the snapshot.
+        simulation: Snapshot of the simulation.
+        rngs: States of the n random generators, with their seeds.
+        columns: Arrays by name: goals, delayed actions, and delayed camera measurements. A vector
+            environment adds the number of steps of each episode, and whether the episode has ended.
     """
 
     kind: Mapping[str, Any]
@@ -202,8 +204,9 @@ class Core:
             The randomisation of each episode; empty dictionaries without randomisation.
 
         Raises:
-            ResetOptionError: If an option is not possible; nothing has happened then.
-            UnreachableError: If an object or the goal is out of reach; nothing has happened then.
+            ResetOptionError: If an option is not possible; the environments are then unchanged.
+            UnreachableError: If an object or the goal is out of reach; the environments are then
+                unchanged.
         """
         self.require_open()
         before = [rng.bit_generator.state for rng in rngs] if options is not None else []
@@ -238,7 +241,8 @@ class Core:
 
         Args:
             actions: (n, action_size) finite numbers; clipped to [-1, 1].
-            running: (r,) environments whose encoders are read with noise.
+            running: (r,) environments whose episode is running. Encoder noise is drawn only for
+                these environments.
         """
         actions = np.minimum(np.maximum(actions, -1.0), 1.0)
         late = self._pending
@@ -354,7 +358,10 @@ class Core:
         return self._state
 
     def save(self, **columns: NDArray[Any]) -> EnvSnapshot:
-        """Return everything that the next steps depend on, with the caller's own columns.
+        """Return a snapshot of everything that the next steps depend on.
+
+        Args:
+            columns: Further arrays to keep in the snapshot, by name.
 
         Raises:
             EpisodeError: If no episode is running.
@@ -377,8 +384,8 @@ class Core:
 
         Raises:
             EpisodeError: If the environments are closed.
-            InputError: If ``snapshot`` is no snapshot of equal environments; nothing has happened
-                then.
+            InputError: If ``snapshot`` is no snapshot of equal environments; the environments are
+                then unchanged.
         """
         self.require_open()
         self.require_equal(snapshot)

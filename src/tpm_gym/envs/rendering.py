@@ -23,7 +23,7 @@ RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple", "segmentation
 
 
 class Rendering:
-    """Options of frames: mode, camera and size; see :class:`tpm_gym.TPMEnv`.
+    """Options of frames: render mode, camera and size; see :class:`tpm_gym.TPMEnv`.
 
     Raises:
         ConfigurationError: If an option is out of range.
@@ -43,10 +43,15 @@ class Rendering:
         self.view = View(camera, int(width), int(height), segmented)
 
     def frame(self, simulation: Simulation, row: int, markers: ArrayLike) -> Any:
-        """Draw a frame of the mode; ``markers`` (k, 3) m are the goal markers.
+        """Draw one environment in the render mode.
+
+        Args:
+            simulation: Simulation of all environments.
+            row: Index of the environment.
+            markers: Points (k, 3) m, world frame, at which the k goal markers are drawn.
 
         Raises:
-            ConfigurationError: If the engine cannot draw frames of the mode.
+            ConfigurationError: If the engine cannot draw in the render mode.
         """
         if self.mode == "rgb_array":
             return simulation.picture(self.view, markers, row).colour
@@ -58,7 +63,7 @@ class Rendering:
 
 
 class Pixels:
-    """Pictures as observations; they replace the entries of the objects.
+    """Pixel observations: a picture replaces the objects' values in the observation vector.
 
     Raises:
         ConfigurationError: If an option is out of range.

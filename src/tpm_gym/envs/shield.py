@@ -1,14 +1,15 @@
 """Shield: the nearest command that keeps the machine away from singularities.
 
-Let c be the last command, d the next one, and m the middle of the last two commands. In a control
-period, point P follows the Bezier curve with the control points m, c and (c + d) / 2. If the
-command then stays at d, P moves on to d in a straight line. The command d is safe if the
-conditioning 1/cond(J) stays at ``least`` or above on curve and line. So it is always safe to hold
-the last command c: P then moves on the line from m to c, and the check of c included this line.
+Let c be the last command, b the middle between c and the command before c, and d the next command.
+In a control period, point P follows the Bezier curve with the control points b, c and (c + d) / 2.
+If the command then stays at d, P moves on to d in a straight line. The command d is safe if the
+conditioning 1/cond(J) stays at ``least`` or above on this curve and this line. So it is always safe
+to hold the last command c: P then moves on the line from b to c, and the check of c included this
+line.
 
-Curve and line lie in the triangle of m, c and d. The safe part of the region is almost convex.
-Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning =
-least``. This point is found by sequential quadratic programming, and its path is checked. If the
+The curve and the line lie in the triangle of b, c and d. The safe part of the region is almost
+convex. Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning
+= least``. This point is found by sequential quadratic programming, and its path is checked. If the
 check fails, the search is repeated with a larger conditioning as its aim. If all searches fail, the
 command is moved towards the last command.
 
@@ -40,8 +41,8 @@ machine's ``safe_conditioning``."""
 TOLERANCE = 2e-5
 """Amount by which the conditioning at commands should exceed ``least``.
 
-The check of a path requires half of this amount. The other half is a reserve for errors between
-the nodes.
+The check of a path requires half of this amount. It is a reserve for errors of the check, which
+computes the conditioning at seven points of the path and interpolates between them.
 """
 _FAR = 1.05
 """If the conditioning at three successive commands is at least this multiple of ``Shield.least``,
@@ -58,14 +59,14 @@ _NUDGE = 1e-4  # displacement for derivatives of the conditioning, as a fraction
 
 @cache
 def _nodes() -> FloatArray:
-    """Return weights (7, 3) of m, c and d for seven points: five on the curve, two on the line."""
-    s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 m + 2 s (1-s) c + s^2 (c + d) / 2
+    """Return weights (7, 3) of b, c and d for seven points: five on the curve, two on the line."""
+    s = np.arange(5)[:, None] / 4  # the curve (1-s)^2 b + 2 s (1-s) c + s^2 (c + d) / 2
     curve = np.hstack([(1 - s) ** 2, 2 * s * (1 - s) + s**2 / 2, s**2 / 2])
     return np.vstack([curve, [[0.0, 0.25, 0.75], [0.0, 0.0, 1.0]]])
 
 
 class Problem(NamedTuple):
-    """Search for the nearest safe commands of r robots.
+    """Data of a search for the nearest safe commands of r robots.
 
     Attributes:
         wanted: (r, 3) wanted commands, in units of the action.
@@ -86,9 +87,9 @@ class Shield:
     """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
     Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
-    control, increments of the joints with joint control. They are measured from the wanted command,
-    which the control computes from the action. The returned command is at most 0.003 of these
-    units farther from the wanted command than the nearest safe command is.
+    control, increments of the joints with joint control. The wanted command is the command that the
+    control computes from the action. The returned command is at most 0.003 of these units farther
+    from the wanted command than the nearest safe command is.
 
     Args:
         machine: Nominal machine.
@@ -131,7 +132,7 @@ class Shield:
         return command
 
     def _lack(self, corners: FloatArray) -> FloatArray:
-        """Return the conditioning (r,) that paths lack; their corners m, c, d are (r, 3, 3) m."""
+        """Return the conditioning (r,) that paths lack; their corners b, c, d are (r, 3, 3) m."""
         return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
@@ -210,8 +211,9 @@ class BrakingShield:
     def command(self, wanted: FloatArray, recent: FloatArray) -> FloatArray:
         """Return safe commands (n, 3) m between the braking commands and the wanted ones.
 
-        If even braking leads to a conditioning below ``least``, the returned command is no worse:
-        the smallest conditioning on its path is at least that on the path of braking.
+        If even braking leads to a conditioning below ``least``, the returned command is no worse
+        than braking: the conditioning on its path is never below the smallest conditioning on the
+        path of braking.
 
         Args:
             wanted: (n, 3) m, commands by control and follower, machine's frame.
@@ -256,15 +258,15 @@ class BrakingShield:
 def make_shield(
     shield: Any, machine: Machine, control: Control, follower: Follower | None, exact: bool
 ) -> Shield | BrakingShield:
-    """Return the shield of an environment's option.
+    """Build the shield for the option ``shield`` of an environment.
 
     Args:
         shield: The conditioning to keep, or True for the machine's ``safe_conditioning``.
         machine: Nominal machine.
         control: Control of the environment.
         follower: Limit of the control's commands, if their accelerations are bounded.
-        exact: Whether the robot follows its commands exactly. If it does not, ``shield=True`` adds
-            the fraction :data:`MARGIN` to the conditioning to keep.
+        exact: Whether the robot follows its commands exactly. If it does not, the conditioning to
+            keep with ``shield=True`` is (1 + :data:`MARGIN`) times ``safe_conditioning``.
 
     Raises:
         ConfigurationError: If the option is neither True nor a number in (0, 1], if the
@@ -290,7 +292,7 @@ def make_shield(
 
 
 def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
-    """Return the smallest conditioning (r,) on paths; their corners m, c, d are (r, 3, 3)."""
+    """Return the smallest conditioning (r,) on paths; their corners b, c, d are (r, 3, 3) m."""
     points = loops().spline_points(corners, _nodes())
     found: FloatArray = lowest(machine.conditioning_at(points))
     return found
@@ -298,9 +300,10 @@ def _lowest_on_path(machine: Machine, corners: FloatArray) -> FloatArray:
 
 @kept
 def lowest(values: FloatArray) -> FloatArray:
-    """Return the smallest values (r,) on curve and line, from the values (r, 7) at the nodes.
+    """Return the smallest value on each of r paths, (r,), from the values (r, 7) at seven nodes.
 
-    Between nodes, values are interpolated by parabolas through three successive nodes.
+    A path is a curve with the nodes 0 to 4, and then a straight line with the nodes 4 to 6. Between
+    nodes, values are interpolated by parabolas through three successive nodes.
     """
     found = np.empty(len(values))
     for row in range(len(values)):
@@ -330,9 +333,9 @@ def solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Solve problems with linearised conditioning, by Hildreth's method.
 
-    For each constraint in turn, the point is pushed until the constraint holds with equality. If
-    the constraint holds with a reserve, the point is moved back, but not farther than this
-    constraint has pushed it in total.
+    The constraints are treated in turn. If a constraint is violated, the point is pushed until the
+    constraint holds with equality. If a constraint holds with a reserve, the point is moved back,
+    but not farther than this constraint has pushed it in total.
 
     Args:
         point: (r, 3) m, where the conditioning is linearised.

@@ -62,9 +62,10 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Frames
 
-    World: z up, table top at z = 0, x and y as seen from above. The base hangs upside down, so
-    world = (x, -y, height - z) of the paper's frame; the workspace is a slab of negative world y.
-    Point P is the middle of the platform; the vacuum cup ends 40 mm below it.
+    The world frame is right-handed, with z up and the table top at z = 0. The base hangs upside
+    down at z = height: a point (x, y, z) of the paper's frame is (x, -y, height - z) in the world.
+    In the world frame, the workspace is thin along y and lies at negative y. Point P is the middle
+    of the platform; the vacuum cup ends 40 mm below it.
 
     ## Action
 
@@ -73,14 +74,16 @@ class TPMEnv(gym.Env[Observation, Action]):
     | entries | meaning |
     | --- | --- |
     | 0 to 2, Cartesian | increment of the command for P, paper's x, y, z: at most 30, 5, 30 mm |
-    | 0 to 2, joints | increment of theta_1 to theta_3: at most 0.08 rad, P at most as above |
+    | 0 to 2, joints | increments of theta_1 to theta_3: at most 0.08 rad each |
     | 3, with vacuum | above 0: vacuum on |
 
-    Commands accumulate and are projected into the task region; P follows them along a B-spline. The
-    region is -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m for P, world. Small
-    turns of the joints move P far along y. Therefore the limit for P scales most random joint
-    actions down to a tenth, with one factor for all three joints. Cycle has control steps of 4 ms,
-    smaller increments and bounded accelerations.
+    Increments change the last command, and the result is projected into the task region. P
+    follows the commands along a B-spline. In the world frame, the task region of P is
+    -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m. Along each axis, joint
+    increments move P no farther than the largest Cartesian increment. Small turns of the joints
+    move P far along y. Therefore the limit along y scales most random joint actions down to a
+    tenth, with one factor for all three joints. Cycle has control steps of 4 ms, smaller increments
+    and bounded accelerations.
 
     ## Observation
 
@@ -96,16 +99,16 @@ class TPMEnv(gym.Env[Observation, Action]):
     | object_position | 3 | centre of the object, from a camera |
     | object_offset | 3 | top of the object minus lip of the cup |
     | object_velocity | 3 | velocity of the object, from a camera |
-    | object_tilt | 2 | x and y of the object's axis |
-    | object_held | 1 | vacuum by a gauge, 0 to 1; 0 if the object is not held |
+    | object_tilt | 2 | x and y of the unit vector along the object's z axis |
+    | object_held | 1 | vacuum, measured by a gauge, 0 to 1; 0 if the object is not held |
 
     The entries of the object are repeated for each object. Push adds the object's turn about the
     vertical, and Conveyor the speed of the belt. Entries of the robot come from the encoders alone,
     never from the simulated platform.
 
     With ``observations="pixels"`` the dictionary has a fourth entry: ``pixels``, (84, 84, 3) uint8,
-    a picture from the camera of the option ``camera``. ``observation`` then has only the entries of
-    the robot. The goals stay vectors, as hindsight needs them. ``achieved_goal`` contains the
+    a picture from the camera of the option ``camera``. ``observation`` then has no entries of
+    objects. The goals stay vectors, as hindsight needs them. ``achieved_goal`` contains the
     position of the block; a policy for cameras alone must not use it.
 
     ## Reward
@@ -128,8 +131,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Start
 
     The arm is at rest at home (Cycle: at one end). Blocks (square, 36 mm wide, 30 mm high, 50 g)
-    are flat on the table or the belt. Goals and objects are sampled at least 30 mm
-    away from each other (Reach: from P), where 1/cond(J) >= 0.08.
+    are flat on the table or the belt. Goals and objects are sampled where 1/cond(J) >= 0.08, and
+    at least 30 mm away from each other. In Reach, the goal is at least 30 mm away from P.
     ``reset(options={"object": (x, y, z), "goal": (x, y, z)})`` sets both; a block that starts above
     the table falls.
 
@@ -140,13 +143,13 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``is_success`` | whether the goal is achieved |
     | ``closure_error`` | largest gap of the simulated loops, m; always 0 in the analytic engine |
     | ``vacuum`` | pressure in the cup below the ambient pressure, Pa |
-    | ``conditioning`` | 1/cond(J) by the encoders |
+    | ``conditioning`` | 1/cond(J), computed from the encoders |
     | ``singularity_penalty`` | penalty before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
     | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
-    | ``object_lost`` | whether an object is off the table or out of reach |
+    | ``object_lost`` | whether an object left the table or the area of starts, reach and goals |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
-    | ``randomisation`` | the episode's plant; only from reset(), with the option of this name |
+    | ``randomisation`` | the episode's plant; only from reset(), if this option is set |
 
     Here y is in the paper's frame, and l7 is the length of link 7. Crossing adds ``crossed``:
     whether P is on the other side of y = 0 than home. Push adds ``toppled``: whether the block lies
@@ -165,18 +168,19 @@ class TPMEnv(gym.Env[Observation, Action]):
             :func:`tpm_gym.register_task` has registered), a :class:`~tpm_gym.tasks.Task` class, or
             an instance, which keeps its own machine, reward, goals and penalty weight.
         control: ``"cartesian"`` or ``"joints"``.
-        reward: ``"sparse"`` (None too) or ``"dense"``.
+        reward: ``"sparse"`` (also for None) or ``"dense"``.
         engine: ``"pybullet"``, ``"analytic"``, ``"mujoco"`` (with the extra of that name), or a
             name that :func:`tpm_gym.register_engine` has registered. The analytic engine draws with
             PyBullet, or with MuJoCo where PyBullet is not installed.
-        machine: ``"paper"`` (None too), ``"wide"``, a name that :func:`tpm_gym.register_machine`
-            has registered, or a :class:`~tpm_gym.Machine`; a spec that is written as JSON needs a
-            name.
-        goals: ``"sampled"`` (None too), or ``"tempting"``: goal and start of the block lie next to
-            a singularity. This is possible only if the machine's region for goals has such places.
+        machine: ``"paper"`` (also for None), ``"wide"``, a name that
+            :func:`tpm_gym.register_machine` has registered, or a :class:`~tpm_gym.Machine`. To
+            write the environment's spec as JSON, give a name.
+        goals: ``"sampled"`` (also for None), or ``"tempting"``: goal and start of the block lie
+            next to a singularity. This is possible only if the machine's region for goals has such
+            places.
         penalty_weight: Weight of the singularity penalty, None for 1; 0 switches it off.
-        drive: Drive of the motors. ``"ideal"`` (None too) follows references exactly, with up to
-            100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references.
+        drive: Drive of the motors. ``"ideal"`` (also for None) follows references exactly, with up
+            to 100 N m at any speed. ``"servo"`` is a servo drive, which lags behind the references.
             Its gains are 7500 N m/rad, 60 N m s/rad; the torques of the nominal motion are fed
             forward. Its largest torque is 100 N m up to 18.75 rad/s, and falls to zero at
             25 rad/s. For a servo drive with other parameters, give a
@@ -188,16 +192,17 @@ class TPMEnv(gym.Env[Observation, Action]):
         shield: Whether each action is replaced by the nearest one that keeps the conditioning at
             the machine's ``safe_conditioning`` or above, over the whole control period. With servo
             drives or randomisation, True keeps 15% more. A number is the conditioning to keep.
-        physics: Numerical settings of the engine, or a mapping of them. All have ``time_step``, s;
-            the others are in ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``.
+        physics: Numerical settings of the engine: a ``Physics`` from
+            ``tpm_gym.simulation.{bullet,mujoco,analytic}.physics``, or a mapping of its attributes,
+            such as ``time_step`` (s).
         observations: ``"state"``, or ``"pixels"``: see above.
         pixel_size: Width and height of the pictures in pixel observations.
         render_mode: Result of ``render()``. None: nothing. ``"human"``: a window, in real time, on
             a display. ``"rgb_array"``: (height, width, 3) uint8. ``"depth_array"``: (height, width)
             float32, distance along the camera's axis in m, infinite where there is no body.
             ``"rgbd_tuple"``: both. ``"segmentation"``: (height, width) int32, 0 background and
-            floor, 1 table, 2 robot, 3 vacuum cup, 4 + k object k. Goal markers are in colours only,
-            not in distances or segmentation.
+            floor, 1 table, 2 robot, 3 vacuum cup, 4 the first object, 5 the second, and so on.
+            Goal markers are drawn in colour pictures, but not in distances or segmentation.
         renderer: Renderer of pictures; for PyBullet ``"tiny"`` (any computer) or ``"egl"`` (GPU),
             for MuJoCo ``"egl"``, ``"osmesa"`` or ``"glfw"``; None for the first that works.
         camera: ``"table"`` (task region, close by), ``"overview"`` (whole robot), ``"cup"``
@@ -210,7 +215,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         ConfigurationError: If an option is out of range.
         MissingPackageError: If the engine's package is not installed.
 
-    An environment keeps some 29 MB, 28 of them PyBullet's client, until it is closed or deleted.
+    An environment with PyBullet takes about 29 MB of memory until it is closed or deleted.
+    PyBullet's client takes 28 MB of this memory.
 
     ## Version history
 
@@ -296,8 +302,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             ResetOptionError: If an option is unknown, has the wrong shape, is not finite, or would
-                put an object into another or into the robot; nothing has happened then.
-            UnreachableError: If an object or the goal is out of reach; nothing has happened then.
+                put an object into another or into the robot; the environment is then unchanged.
+            UnreachableError: If an object or the goal is out of reach; the environment is then
+                unchanged.
             EpisodeError: If the environment is closed.
             ConfigurationError: If a method of the task returns a wrong shape, type or value.
         """
@@ -319,7 +326,8 @@ class TPMEnv(gym.Env[Observation, Action]):
         """Run one control step.
 
         Raises:
-            ActionError: If the action has the wrong shape or is not finite; nothing has moved then.
+            ActionError: If the action has the wrong shape or is not finite; the environment is then
+                unchanged.
             EpisodeError: If there is no episode: before reset, after close or after a ClosureError.
             ClosureError: If a loop of the mechanism opened.
             ModeChangeError: If the mechanism passed a singularity earlier in this episode.
@@ -432,8 +440,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Raises:
             EpisodeError: If the environment is closed.
-            InputError: If ``snapshot`` is no snapshot of an equal environment; nothing has
-                happened then.
+            InputError: If ``snapshot`` is no snapshot of an equal environment; the environment is
+                then unchanged.
         """
         observation = self._core.restore(snapshot)
         (rng,) = self._core.rngs

@@ -1,8 +1,8 @@
 """Conformance checks for environments with your own task, machine or engine.
 
 Each check takes a callable that makes an environment through Gymnasium, such as
-``lambda: gym.make("TPMMine-v0")``. It raises a :class:`~tpm_gym.errors.ConformanceError` that says
-which promise is broken. With pytest::
+``lambda: gym.make("TPMMine-v0")``. If the environment breaks a promise, the check raises a
+:class:`~tpm_gym.errors.ConformanceError` that names the promise. With pytest::
 
     @pytest.mark.parametrize("check", CHECKS)
     def test_mine_conforms(check):
@@ -70,7 +70,10 @@ def check_env(make: Make) -> None:
 
 
 def random_episode(env: Env, seed: int, steps: int = 50) -> Iterator[Step]:
-    """Reset with ``seed``, then step with random actions at full speed; yield every result."""
+    """Reset with ``seed``, then take random steps; yield the results of the reset and each step.
+
+    Each component of the actions is -1, 0 or 1.
+    """
     rng = np.random.default_rng(seed)
     observation, info = env.reset(seed=seed)
     yield observation, 0.0, info
@@ -100,7 +103,7 @@ def bits(value: Any) -> Any:
 
 
 def play(env: Env, actions: Iterable[Any]) -> list[Any]:
-    """Return the bits of the results of each step, and of the state after the step."""
+    """Play actions; return each step's results and the state after it, with arrays as bytes."""
     return [(bits(env.step(action)), _state_of(env)) for action in actions]
 
 
@@ -220,7 +223,7 @@ def shares_no_memory(make: Make) -> None:
 
 
 def computes_rewards_of_batches(make: Make) -> None:
-    """Compare compute_reward with the rewards of an episode, and relabel its goals."""
+    """Check compute_reward for the goals of an episode, and for goals that it has achieved."""
     with closing(make()) as env:
         steps = list(random_episode(env, 8))[1:]
         inner: Any = env.unwrapped
@@ -247,7 +250,7 @@ def computes_rewards_of_batches(make: Make) -> None:
 
 
 def bad_actions(size: int) -> Iterator[Any]:
-    """Yield values that are no actions of this length."""
+    """Yield values that are not valid actions of length ``size``."""
     ones = np.ones(size)
     yield from (np.full(size, np.nan), np.where(np.arange(size) == 1, np.inf, ones))
     yield from (np.ones(size + 1), np.ones((1, size)), 0.0, None, [[0.0], [0.0, 1.0]], {})
@@ -259,7 +262,7 @@ def bad_actions(size: int) -> Iterator[Any]:
 
 
 def refuses_bad_actions_and_has_not_moved_then(make: Make) -> None:
-    """Step with values that are no actions; check that state and later steps do not change."""
+    """Step with values that are not valid actions; check that state and later steps stay equal."""
 
     def run(env: Env, hostile: bool) -> Any:
         half: NDArray[Any] = np.full(env.action_space.shape or (), 0.5)
@@ -277,7 +280,10 @@ def refuses_bad_actions_and_has_not_moved_then(make: Make) -> None:
 
 
 def clips_actions_and_leaves_them_as_they_are(make: Make) -> None:
-    """Compare results of larger actions with those of actions at the bounds of the action space."""
+    """Check that actions beyond the bounds of the action space act like actions at its bounds.
+
+    Also check that step() does not change the action.
+    """
 
     def run(env: Env, size: float) -> Any:
         env.reset(seed=10)
@@ -349,7 +355,10 @@ def refuses_steps_outside_an_episode(make: Make) -> None:
 
 
 def continues_copies_and_snapshots_equally(make: Make) -> None:
-    """Continue an episode, its snapshot, a copy and a pickle; compare them until the next reset."""
+    """Continue an episode in a copy, after pickling, and from a snapshot.
+
+    The results must equal those of the original environment, up to and including the next reset.
+    """
     with closing(make()) as env, closing(make()) as restored:
         steps = min(15, _steps_of(env) // 2)
         for other in (env, restored):  # wrappers count their own steps

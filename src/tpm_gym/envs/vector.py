@@ -58,8 +58,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             stepped one after another.
         num_threads: Threads that step the environments of the analytic engine.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
-        autoreset_mode: When environments whose episode ended are reset: ``NEXT_STEP``,
-            ``SAME_STEP`` (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (by
+        autoreset_mode: Time of the reset after the end of an episode: ``NEXT_STEP``, ``SAME_STEP``
+            (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (the user calls
             ``reset(options={"reset_mask": ...})``).
         stagger: Whether the first episodes after a full reset have different lengths, so that
             they do not all end at the same step. This makes on-policy batches more even.
@@ -174,8 +174,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
                 for all environments.
 
         Raises:
-            InputError: If a seed is not possible, or the number of seeds is not n; nothing has
-                happened then.
+            InputError: If a seed is not possible, or the number of seeds is not n; the environments
+                are then unchanged.
             ResetOptionError: If the mask is not valid; also the errors of ``TPMEnv.reset``.
             EpisodeError: If the environments are closed.
         """
@@ -278,7 +278,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         """Draw the first environments side by side, as one picture.
 
         Args:
-            count: Number of environments; all of them if there are fewer.
+            count: Number of environments to draw. If there are fewer, all environments are drawn.
             columns: Pictures in each line; with None, there are about as many columns as lines.
 
         Raises:
@@ -367,7 +367,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             The observation at that moment.
 
         Raises:
-            InputError: If they are not snapshots of equal environments; nothing has happened then.
+            InputError: If they are not snapshots of equal environments; the environments are then
+                unchanged.
         """
         self._require_open()
         if not isinstance(snapshots, list) or len(snapshots) != len(self._parts):
@@ -397,7 +398,14 @@ class _Part:
     def reset(
         self, rows: IntArray, rngs: Sequence[np.random.Generator | None], options: Any
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start episodes in some environments, with new generators where some are given."""
+        """Start episodes in the environments ``rows``.
+
+        ``rngs`` has an entry for each of the n environments: a new generator, or None if the
+        environment keeps its generator.
+
+        Returns:
+            Observations and infos of all n environments.
+        """
         core = self.core
         own = core.rngs or [seeding.np_random(None)[0] for _ in range(core.count)]
         infos, first = {}, not core.rngs
@@ -447,7 +455,16 @@ class _Part:
         return observation, reward, ended, infos
 
     def _begin_anew(self, observation: Observation, last: Mapping[str, Any]) -> dict[str, Any]:
-        """Reset ended environments, replace their observations, and return old and new infos."""
+        """Reset the environments whose episodes ended, and return the infos of all environments.
+
+        In ``observation`` and in the returned infos, the first values of the new episodes replace
+        the last values of the ended episodes. The last values are in ``final_obs`` and
+        ``final_info`` of the returned infos.
+
+        Args:
+            observation: Observations after the last step; changed.
+            last: Infos after the last step.
+        """
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
         for row in rows.tolist():
@@ -499,7 +516,10 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
-    """Add a mask (n,) for each entry: true in ``rows``, or everywhere if ``rows`` is None."""
+    """Return ``info`` with a mask ``_key`` (count,) for each ``key``.
+
+    The mask is true in ``rows``, or everywhere if ``rows`` is None.
+    """
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
         mask[:] = False
@@ -513,7 +533,11 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return a copy of a step's infos ``last``, with new episodes' infos ``first`` in ``rows``."""
+    """Return a copy of the infos ``last``, in which ``first`` replaces the values of ``rows``.
+
+    ``last`` are the infos of a step, and ``first`` the infos of new episodes in the environments
+    ``rows``.
+    """
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):

@@ -1,10 +1,10 @@
-"""Functions of a namespace, for floats in compiled code; see :mod:`tpm_gym.compiling`.
+"""Elementary functions (sine, square root and others) of floats, for compiled code.
 
-Compiled functions get this module as their namespace ``ns``. The functions have no branches and
+Compiled equations get this module as their namespace ``ns``. The functions have no branches and
 call no library. So the compiler can compute several rows at a time (SIMD), and results do not
-depend on a C library. Results are accurate to two units in the last place, those of ``cos_third``
-to four. The polynomials are minimax fits (Remez's exchange algorithm with 60 digits). A test
-compares the functions with mpmath.
+depend on a C library. Results are accurate to two units in the last place; results of ``cos_third``
+are accurate to four units. The polynomials are minimax fits (Remez's exchange algorithm with 60
+digits). A test compares the functions with mpmath.
 
 Importing this module lets compiled functions call :mod:`tpm_gym.kinematics.equations`, too.
 """

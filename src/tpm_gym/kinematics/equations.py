@@ -10,9 +10,9 @@ where theta_i = pi, or where the coefficient of the squared tangent (the paper's
 The functions compute with the numbers of their namespace ``ns``: arrays and tensors
 (:mod:`tpm_gym.kinematics.namespaces`), or floats in compiled code
 (:mod:`tpm_gym.kinematics.compiled`). Components (x, y, z or theta_1 to theta_3) are separate
-numbers (...,), and signs of branches broadcast with them. The functions check and raise nothing.
-Besides a solution, they return whether the solution is real, and the lengths that explain why it is
-not real.
+numbers (...,), and signs of branches broadcast with them. These functions do not check their
+arguments, and raise no errors. Besides a solution, they return whether the solution is real, and
+the lengths that explain why it is not real.
 """
 
 import math
@@ -269,10 +269,15 @@ def regular(values: Factors, g: AnyLengths) -> Numbers:
 def link_velocity(
     bars: tuple[Triple, Triple, Triple], values: Factors
 ) -> tuple[tuple[Numbers, Numbers], tuple[Numbers, Numbers], Triple]:
-    """Compute the rates of xC, zC and l7 beta for unit rates of the motors, m/rad.
+    """Compute the derivatives of xC, zC and the product l7 * beta by the joint positions, m/rad.
 
-    The rates solve a linear system, the derivatives of the closures by time. The determinant of
-    this system is sin(beta) * level3 * planar. Motor 3 does not move link 3'.
+    They solve a linear system: the equations of the loop closures, differentiated with respect to
+    time. The determinant of this system is the product of sin(beta) and the factors ``level3`` and
+    ``planar`` in :class:`Factors`.
+
+    Returns:
+        Derivatives of xC and of zC by theta_1 and theta_2 (motor 3 does not move link 3'), and of
+        l7 * beta by all three joint positions.
     """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = bars
     # Divisions take longer than all else, so each divisor is inverted once.

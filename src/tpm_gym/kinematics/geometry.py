@@ -8,10 +8,10 @@ from tpm_gym.errors import GeometryError, InputError
 from tpm_gym.kinematics.namespaces import Numbers
 
 _CLOSE = 1e-4
-"""Limit for the lengths, as a fraction of l1. :class:`Geometry` refuses lengths for which l1 - l3
-(the smallest y_B1; may be negative) is below this limit, and l5 or |l5 - l1| is below it too. With
-such lengths, the two circles of Eq. (6) can nearly coincide, and their intersections would be
-inaccurate."""
+"""Limit for two numbers, as a fraction of l1. The first number is l1 - l3, the smallest y_B1, which
+may be negative. The second number is the smaller of l5 and |l5 - l1|. :class:`Geometry` refuses
+lengths for which both numbers are below the limit. With such lengths, the two circles of Eq. (6)
+can nearly coincide, and their intersections would be inaccurate."""
 
 
 class Lengths(NamedTuple):

@@ -1,4 +1,4 @@
-"""Jacobians, their singular factors, and conditioning, for batches, in the paper frame.
+"""Jacobians, their singular factors, and conditioning, for batches, in the paper's frame.
 
 The closures are f_i = |B_iC_i|^2 - l4^2 = 0. Their derivatives by time are A v = B theta_dot, with
 the platform's velocity v (section "Singularity analysis"). Configurations are given by the actuated
@@ -62,10 +62,10 @@ def parallel(
 ) -> FloatArray:
     """Compute the parallel Jacobian A of A v = B theta_dot, (..., 3, 3) m.
 
-    Point P is (x, y, z). Eliminating the passive angle beta through y = l7 sin(beta) gives
-    dxC = dx + tan(beta) dy, and tan(beta) is infinite at y = +-l7. To keep A finite, rows 1 and 2
-    are multiplied by cos(beta). With these rows, det A is -cos(beta) times the product of the
-    factors of Eq. (16).
+    Point P is (x, y, z), and xC is the x coordinate of point C1 of link 3'. The equation
+    y = l7 sin(beta) eliminates the passive angle beta: dxC = dx + tan(beta) dy. At y = +-l7,
+    tan(beta) is infinite. To keep A finite, rows 1 and 2 are multiplied by cos(beta). With these
+    rows, det A is -cos(beta) times the product of the factors of Eq. (16).
     """
 
     def results(c: _Configuration) -> list[Numbers]:
@@ -110,7 +110,10 @@ def velocity(
 def link_velocity(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute d(xC, zC, l7 beta) / d(theta), (..., 3, 3) m/rad.
+    """Compute the derivatives of link coordinates by the joint positions, (..., 3, 3) m/rad.
+
+    The rows belong to xC, zC and l7 beta, the columns to theta_1, theta_2 and theta_3. (xC, zC) is
+    point C1 of link 3', and beta is the passive angle of link 7.
 
     Raises:
         SingularityError: If theta is a parallel singularity.
@@ -157,7 +160,7 @@ def conditioning_at(
 def evaluate(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> Evaluation:
-    """Compute position, J and conditioning from one solution.
+    """Compute P, J and conditioning at theta; the forward kinematics are solved only once.
 
     Raises:
         SingularityError: If theta is a parallel singularity.

@@ -44,8 +44,8 @@ class AssemblyMode(_Mode):
 
     Attributes:
         planar: Sign of the planar factor xC (zC - zB2) - (zC - zB1)(xC - 2 l5 - xB2) of Eq. (16).
-            C1 is an intersection of the two circles of Eq. (6). The line through the circles'
-            centres has an intersection on each side; the sign selects the side.
+            The two circles of Eq. (6) intersect at two points, one on each side of the line through
+            the circles' centres. The sign selects the point that is C1.
         sin_beta: Sign of sin(beta), and so of y: the side of y = 0 on which the platform is.
     """
 
@@ -120,8 +120,8 @@ class ForwardSolutions:
     """All solutions of the forward kinematics, one slot per :data:`ASSEMBLY_MODES` entry.
 
     Attributes:
-        position: (..., 4, 3) m, point P in the paper frame; NaN where the branch is not real. Where
-            the mechanism closes for every beta (see ``free``), x and y are NaN, but z is not.
+        position: (..., 4, 3) m, point P in the paper's frame; NaN where the branch is not real.
+            Where the mechanism closes for every beta (see ``free``), x and y are NaN, but z is not.
         beta: (..., 4) rad, passive angle of link 7 in (-pi, pi]; NaN where the branch is not real.
         valid: (..., 4) bool, whether the branch is real.
         geometry: Lengths of the mechanism.

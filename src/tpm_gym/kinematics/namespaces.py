@@ -142,12 +142,12 @@ def by_rows(
     """Evaluate the equations in the function ``text`` for points (..., k), in blocks of n points.
 
     ``text`` takes two arguments: a tuple of the k components of a block's points, each an array
-    (n,); and the namespace. Each result of ``text`` is a column (n,), a tuple of m columns, or a
-    tuple of l such tuples.
+    (n,); and the namespace. Each result of ``text`` is a column (n,), a tuple of q columns, or a
+    tuple of p such tuples.
 
     Returns:
-        For each result of ``text``, an array for all points: (...,) for a column, (..., m) for a
-        tuple of m columns, (..., l, m) for a tuple of l such tuples.
+        For each result of ``text``, an array for all points: (...,) for a column, (..., q) for a
+        tuple of q columns, (..., p, q) for a tuple of p such tuples.
     """
     ns, shape = namespace_of(points), points.shape[:-1]
     flat = points.reshape(-1, points.shape[-1])

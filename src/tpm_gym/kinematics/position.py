@@ -4,9 +4,10 @@ Positions are in the paper's frame; units are m and rad. :mod:`tpm_gym.kinematic
 orders the branches. Torch tensors give tensors on the same device, in float64, which can be
 differentiated. Where branches merge, the derivative is 0 instead of infinite.
 
-All functions raise InputError for inputs that are no array (..., 3) of numbers. Functions on all
-branches return invalid branches for entries that are not finite. Functions on one branch raise
-InputError for such entries, and UnreachableError if the branch does not exist for some entry.
+All functions raise InputError for inputs that are no array (..., 3) of numbers. If a vector (3,) of
+the array is not finite, functions on all branches return invalid branches for this vector, and
+functions on one branch raise InputError. Functions on one branch raise UnreachableError if the
+branch does not exist for some vector.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The second operation mode: link 3' and the platform turned about y, in closed form.
+"""Kinematics of the second operation mode, in which link 3' and the platform are turned about y.
 
 Seen along y, leg 1 is a four-bar linkage with opposite sides of equal length: rods 4a and 4b, and
 links 3 and 3'. In the paper's mode it is a parallelogram, in which link 3' only translates. In the
@@ -85,7 +85,10 @@ class RotatedPostures:
 
     @property
     def rods(self) -> FloatArray:
-        """Vectors along rods 4a, 4b and 6, and B3C3 (parallel to both rods 11), (..., 4, 3) m."""
+        """Four vectors (..., 4, 3) m: along rods 4a, 4b and 6, and from B3 to C3.
+
+        The last one is parallel to rods 11a and 11b.
+        """
         half = np.array([self.geometry.l5, 0.0, 0.0])
         b1, b2, b3 = np.moveaxis(_elbows(self.theta, self.geometry), -2, 0)
         feet: FloatArray = np.stack([b1 + half, b1 - half, b2, b3], axis=-2)
@@ -222,14 +225,17 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
 
     def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return rho^2, p and q, where the closure of rod 6 is 2 rho p = q."""
+        """Return rho^2, p and q at a tilt; |rho| is the distance from B1 to C1 seen along y, m.
+
+        The closure of rod 6 is 2 rho p = q.
+        """
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rho2 = reach2 - (2 * g.l5 * n.imag) ** 2
         q = rho2 + abs(kappa + 2 * g.l5 * (u - 1)) ** 2 - g.l4**2
         return rho2, _dot(kappa, n), q
 
     def closures(rho: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
-        """Return the closures of rods 4 and of rod 6, m^2, and the derivatives by rho and tilt."""
+        """Return the closures of rods 4 and rod 6, m^2, and their derivatives by rho and tilt."""
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
         gaps = rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2, abs(rod6) ** 2 - g.l4**2
@@ -330,7 +336,10 @@ def _in_slots(c1: _Planar, tilt: FloatArray, sign: FloatArray) -> tuple[_Planar,
 def _link7(
     theta: FloatArray, link3: _Planar, tilt: FloatArray, g: Geometry
 ) -> tuple[FloatArray, BoolArray]:
-    """Compute cos(beta) from Eqs. (9) and (10) in the frame of link 3'; find if rods 11 fit."""
+    """Compute cos(beta) by Eqs. (9) and (10) in the frame of link 3', and whether beta exists.
+
+    Beta exists if rods 11 have the length l4 for some direction of link 7.
+    """
     b3 = _elbows(theta, g)[..., 2, :]
     to_c1 = (link3 - (b3[..., 0, None] + 1j * b3[..., 2, None])) * np.exp(1j * tilt)
     u, w = to_c1.real + 2 * g.l2, to_c1.imag + g.l6
@@ -379,8 +388,8 @@ def velocity(postures: RotatedPostures) -> FloatArray:
     """Compute rates of P (m/rad) and the tilt (rad/rad) for unit rates of the motors, (..., 4, 3).
 
     The rates keep the lengths of all rods. Rods 4a, 4b and 6 give the velocity and the turn of link
-    3', and rods 11 give the rate of link 7. At a parallel singularity, and where the two operation
-    modes meet, the rates are not finite.
+    3', and rods 11a and 11b give the rate of link 7. At a parallel singularity, and where the two
+    operation modes meet, the rates are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends
     rates = _elbow_rates(postures.theta, g)[..., [0, 0, 1, 2], :]

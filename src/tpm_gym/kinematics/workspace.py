@@ -1,6 +1,6 @@
 """Regions; and the reachability, assembly modes and conditioning of points.
 
-All points are in the paper frame, in metres. Each function considers one working mode.
+All points are in the paper's frame, in metres. Each function considers one working mode.
 """
 
 from collections.abc import Iterator
@@ -24,7 +24,7 @@ from tpm_gym.kinematics.position import inverse_all
 
 @dataclass(frozen=True)
 class Region:
-    """An axis-aligned box in the paper frame.
+    """An axis-aligned box in the paper's frame.
 
     Attributes:
         low: Smallest x, y, z, m.

@@ -49,7 +49,10 @@ class CheckpointStore:
 
     @property
     def newest(self) -> int | None:
-        """Step of the checkpoint that was saved or loaded last; None before the first."""
+        """Step of the checkpoint that was saved or loaded last.
+
+        None if no checkpoint was saved or loaded yet, and after :meth:`clear`.
+        """
         return self._whole[-1] if self._whole else None
 
     def path(self, step: int) -> Path:

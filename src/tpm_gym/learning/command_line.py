@@ -33,7 +33,8 @@ class ExportConfig:
     """Load a .zip file, which can run any code."""
 
     evaluation: Annotated[Path | None, unset(Path, "no card", "PATH")] = None
-    """Results of evaluate --json, to write a model card for the Hugging Face Hub."""
+    """File that evaluate --json wrote. If it is given, a model card for the Hugging Face Hub is
+    written too, with these results."""
 
 
 Command = (

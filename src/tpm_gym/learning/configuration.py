@@ -80,7 +80,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment; "the id's" below means the default of the environment id."""
+    """Options of an environment. The default "the id's" means that the environment id decides."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""
@@ -114,7 +114,7 @@ class EnvOptions:
 GivenEnvOptions = Annotated[
     tyro.conf.OmitArgPrefixes[EnvOptions], tyro.conf.arg(name="environment")
 ]
-"""Options of an environment in a group of their own in the help."""
+"""Options of an environment. The help shows them as a separate group."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,8 @@ class TrainingConfig:
     """Weight of the singularity penalty in the reward; 0 for none."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """Goals: sampled everywhere, or only next to the singularity (tempting)."""
+    """Places of goals: "sampled" is anywhere in the task region, "tempting" is only next to a
+    singularity of the robot."""
 
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
@@ -305,7 +306,10 @@ def _in_whole_rollouts(config: TrainingConfig, reached: int) -> TrainingConfig:
 
 
 def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> TrainingConfig:
-    """Apply the given options to the ``stored`` configuration of a run at the step ``reached``."""
+    """Return the ``stored`` configuration of a run, with the options in ``config`` applied.
+
+    ``reached`` is the number of steps that the run has taken.
+    """
     found = _stored(config.run, stored)
     if config.env not in (UNSET, found.env):
         raise ConfigError(f"--env {config.env}: the run was trained in {found.env}; give that")
@@ -320,7 +324,7 @@ def resumed(config: ResumeConfig, stored: Mapping[str, Any], reached: int) -> Tr
 
 
 def _stored(run: Path, stored: Mapping[str, Any]) -> TrainingConfig:
-    """Build the configuration of a run; refuse missing entries, and entries of other types."""
+    """Build the configuration of a run; raise RunError if an entry of it is missing or invalid."""
     names = {entry.name for entry in fields(TrainingConfig)} - {"overwrite"}
     text = json.dumps({CONFIG_FILE: {name: stored.get(name) for name in names}})
     kind = TypeAdapter(dict[str, TrainingConfig], config=ConfigDict(strict=True, extra="forbid"))
@@ -415,7 +419,7 @@ def _check_recipe(config: TrainingConfig) -> None:
 def _check_device(device: str) -> None:
     """Refuse a device that PyTorch does not have.
 
-    PyTorch itself would refuse the device too late: an earlier run in the folder would be deleted.
+    PyTorch itself would refuse the device only after an earlier run in the folder was deleted.
     """
     import torch
 

@@ -89,13 +89,13 @@ class CollectConfig:
     """Episodes of each dataset."""
 
     seed: int = 0
-    """Seed of the first episode, and of the training of kind replay."""
+    """Seed of the first episode, and of the training for kind "replay"."""
 
     noise: float = 0.3
-    """Standard deviation of the noise in kind noisy, in units of the largest action."""
+    """Standard deviation of the noise in kind "noisy", in units of the largest action."""
 
     steps: Annotated[int, unset(int, "as the recipe says", "INT")] = UNSET
-    """Steps of the training of kind replay."""
+    """Steps of the training for kind "replay"."""
 
     out: Annotated[Path, unset(Path, "Minari's", "FOLDER")] = UNSET
     """Folder of the datasets. Minari's folder is $MINARI_DATASETS_PATH, or ~/.minari/datasets."""
@@ -137,7 +137,11 @@ class Dataset:
 
     @property
     def training(self) -> TrainingConfig:
-        """Training of kind replay; a ConfigError if there is no recipe or the seed is refused."""
+        """Configuration of the training whose policies play the episodes of kind ``replay``.
+
+        Raises:
+            ConfigError: There is no recipe for the environment, or an option is refused.
+        """
         seed, steps, options = self.config.seed, self.config.steps, self.config.env_options
         return complete(TrainingConfig(env=self.env, seed=seed, steps=steps, env_options=options))
 
@@ -148,8 +152,8 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     Raises:
         ConfigError: An option is not valid, or a dataset is there already.
         ConfigurationError: The environment does not have an option, or refuses its value.
-        MissingPackageError: Minari or h5py is not installed; the kind replay also needs PyTorch and
-            Stable-Baselines3.
+        MissingPackageError: A package is not installed. Every dataset needs Minari and h5py; a
+            dataset of kind ``replay`` also needs PyTorch and Stable-Baselines3.
     """
     console = console or Console()
     _require_packages(config.kind)

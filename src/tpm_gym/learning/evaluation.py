@@ -42,7 +42,7 @@ _ROWS = (
     ("return", "return", 1.0, "{:.2f}", ""),
     ("conditioning, least", "conditioning_min", 1.0, "{:.3f}", ""),
     ("conditioning, mean", "conditioning_mean", 1.0, "{:.3f}", ""),
-    ("share of steps below safe", "unsafe_share", *_SHARE),
+    ("share of steps with unsafe conditioning", "unsafe_share", *_SHARE),
     ("closure error, largest", "closure_error_max", 1e3, "{:.4f}", " mm"),
     ("observed P off, largest", "fk_error_max", 1e3, "{:.4f}", " mm"),
     ("torque, RMS", "torque_rms", 1.0, "{:.1f}", " N m"),
@@ -70,7 +70,8 @@ class EvaluationConfig:
     default seed."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """Goals: sampled everywhere, or only next to the singularity (tempting)."""
+    """Places of goals: "sampled" is anywhere in the task region, "tempting" is only next to a
+    singularity of the robot."""
 
     penalty_weight: float = 1.0
     """Weight of the singularity penalty in the return."""
@@ -108,7 +109,7 @@ class Result:
 
     @property
     def events(self) -> dict[str, str]:
-        """Metric of each event -> its table label, as in ``{"crossed_once": "crossed once"}``."""
+        """Label of each event's metric in the table, as in ``{"crossed_once": "crossed once"}``."""
         return {name: name.replace("_", " ") for name in self.records[0].events}
 
     def as_dict(self) -> dict[str, Any]:

@@ -135,7 +135,7 @@ def _is_policy(json_file: Path) -> bool:
 
 
 def _require_free(path: Path) -> None:
-    """Refuse a path that ends in .zip, or whose files would replace files that are no policy."""
+    """Raise an error if ``path`` ends in .zip, or if its files exist and are no exported policy."""
     if path.suffix == ".zip":
         raise ConfigError(f"OUT {path}: is a name for a .json and a .safetensors, not for a .zip")
     pair = files(path)

@@ -35,7 +35,7 @@ class Recipe:
         hindsight: Whether the replay buffer relabels goals.
         demonstrations: Arguments of :class:`~tpm_gym.learning.Demonstrations`; empty for none.
         arguments: Other arguments of the algorithm's constructor.
-        written_for: Id under which the recipe is in its file.
+        written_for: Environment id that the recipe has in the recipe file.
     """
 
     n_timesteps: int
@@ -114,9 +114,9 @@ def recipe_file(algorithm: str, engine: str | None = None) -> Path:
 def algorithm_for(env_id: str, engine: str | None = None, path: Path | None = None) -> str:
     """Return the alphabetically first algorithm with a recipe for an id.
 
-    If no algorithm has a recipe for the id, return the first algorithm whose recipe of
-    pick-and-place the id can use (see :func:`read_recipe`). Without such an algorithm,
-    return ``"sac"``.
+    If no algorithm has a recipe for the id, return the first algorithm for which
+    :func:`read_recipe` returns the recipe of pick-and-place instead. If there is no such algorithm
+    either, return ``"sac"``.
 
     Args:
         env_id: ``id`` or ``module:id``.
@@ -143,7 +143,7 @@ def shipped_for(env_id: str) -> list[str]:
 
 
 def with_classes(entries: Mapping[str, Any]) -> dict[str, Any]:
-    """Return entries of a recipe with classes in place of their names."""
+    """Return a copy of a recipe's entries in which classes replace their names."""
     found = dict(entries)
     if "replay_buffer_class" in found:
         from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer
@@ -186,7 +186,7 @@ def read_recipe(path: Path, algorithm: str, env_id: str) -> Recipe:
 
 
 def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
-    """Read and check all recipes of a file: environment id -> entries."""
+    """Read and check all recipes of a file: environment id -> entries of its recipe."""
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -201,7 +201,13 @@ def read_recipes(path: Path, algorithm: str) -> dict[str, dict[str, Any]]:
 
 
 def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
-    """Raise ConfigError if recipes (name -> entries) have an unknown key or an invalid value."""
+    """Raise ConfigError if recipes have an unknown key or an invalid value.
+
+    Args:
+        source: File or option that the message names as the origin of the recipes.
+        recipes: Entries of each recipe, by name.
+        algorithm: Name of the algorithm.
+    """
     entries = ALGORITHMS[algorithm].entries()
     kind: Any = dict[str, entries]  # type: ignore[valid-type]
     strict = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)

@@ -51,7 +51,7 @@ _Evaluation = TypedDict(
         "return": _Estimate,
     },
 )
-"""Entries of an evaluation that a resumed training needs."""
+"""Values that each line of the evaluations file must have, so that a training can be resumed."""
 RESTORED: Final = (CONFIG_FILE, PROGRESS_FILE, EVALUATIONS_FILE, *_BEST)
 """Files that a checkpoint holds. Resuming replaces each file by its copy in the checkpoint, except
 the configuration, which is written anew. So lines that were added to a file after the checkpoint

@@ -120,8 +120,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
     A run that was killed before its first checkpoint begins again. A finished run is continued only
-    if it is given more steps. Otherwise, only a missing learning curve is drawn, and a missing
-    final test is run.
+    if it is given more steps. If a finished run is given no more steps, it is not trained. A
+    missing learning curve is then drawn, and a missing final test is run.
 
     Raises:
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
@@ -162,7 +162,9 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
 
 
 def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str, Any]:
-    """Apply the options of an earlier resumption that was killed before its first checkpoint.
+    """Return the configuration ``saved``, with the options of ``newest`` that resuming can change.
+
+    These options differ if an earlier resumption was killed before its first checkpoint.
 
     Args:
         saved: Configuration in the checkpoint.
@@ -174,7 +176,7 @@ def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str,
 
 @contextmanager
 def _foreign_named(run: Path) -> Iterator[None]:
-    """Raise a CheckpointError if a checkpoint has the right checksum but wrong entries."""
+    """Raise a CheckpointError if a checkpoint cannot be used, although its checksum is right."""
     try:
         yield
     except TPMError:
@@ -306,7 +308,7 @@ class _Session:
             self._test()
 
     def complete(self) -> bool:
-        """Draw the curve and run the final test if they are missing because the run was killed.
+        """Draw the learning curve and run the final test, if a killed process has not done so.
 
         Returns:
             Whether the final test ran.
@@ -356,7 +358,7 @@ class _Session:
 
 
 def make_model(config: TrainingConfig, envs: VecEnv) -> BaseAlgorithm:
-    """Build the algorithm of a completed configuration."""
+    """Build the algorithm of a configuration in which all options have values."""
     kind = ALGORITHMS[config.algo].load_class()
     keywords = config.recipe.keywords(config.rollout / config.steps)
     return kind(env=envs, seed=config.seed, device=config.device, **keywords)

@@ -227,7 +227,10 @@ def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Return the replay buffer's position and views of its filled part; empty without a buffer."""
+    """Return the replay buffer's position and views of its filled part, by name.
+
+    If the algorithm has no replay buffer, the dictionary is empty.
+    """
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, DictReplayBuffer):
         return {}
@@ -254,7 +257,12 @@ def _restore_buffer(model: BaseAlgorithm, arrays: Mapping[str, NDArray[Any]]) ->
 def _restore_episodes(
     model: BaseAlgorithm, state: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Restore the unfinished episodes; refuse if they do not end in the saved observations."""
+    """Restore the unfinished episodes up to their last step.
+
+    Raises:
+        CheckpointError: If the observations after the last step differ from the saved ones, or an
+            episode cannot be repeated.
+    """
     envs: Any = model.env
     last = starting(arrays, "last/")
     if isinstance(envs, AnalyticVecEnv):

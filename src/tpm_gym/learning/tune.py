@@ -56,14 +56,14 @@ _SPACE: Final[Mapping[str, Sequence[float]]] = {
 }
 """Values to choose from, by entry of the recipe.
 
-Entries that an algorithm does not have are not searched. If the learning rate of the recipe falls
-to zero, the chosen learning rate also falls to zero.
+Entries that an algorithm does not have are not searched. If the recipe's learning rate falls to
+zero during the training, the chosen learning rate is the initial value, and also falls to zero.
 """
 
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """Search for a recipe: many trainings with other hyperparameters, several at a time."""
+    """Search for a recipe: many trainings, each with different hyperparameters, in parallel."""
 
     algo: Annotated[str, tyro.conf.arg(metavar="{" + ",".join(ALGORITHMS) + "}")] = "ppo"
     """Algorithm."""

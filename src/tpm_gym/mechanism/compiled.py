@@ -38,7 +38,7 @@ class CompiledMachine(Machine):
     geometry: Any
 
     _module: ClassVar[str]
-    """Name of the module whose LOOPS are the compiled loops."""
+    """Name of the module whose constant ``LOOPS`` contains the compiled loops over robots."""
     _inertia_of: ClassVar[Any]
     """Function (:class:`Bodies`, geometry) -> constants of the dynamics."""
 
@@ -153,14 +153,17 @@ class CompiledMachine(Machine):
     def built(
         self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
     ) -> FloatArray:
-        """Return the lengths (m) and the constants of the dynamics, (k,); see :class:`Machine`."""
+        """Return the lengths (m) and the constants of the dynamics as one array (k,).
+
+        The arguments are explained in :class:`Machine`.
+        """
         machine = self.with_lengths(lengths) if lengths else self
         inertia = self._inertia_of(Bodies(machine.mechanism, link_masses), machine.geometry)
         return np.concatenate([machine.lengths, *map(np.ravel, inertia)])
 
     @cached_property
     def _own(self) -> tuple[FloatArray, FloatArray]:
-        """Parameters of the nominal machine, (1, k), and the constants."""
+        """Result of :meth:`built` for the nominal machine, as (1, k), and :attr:`_constants`."""
         return self.built()[None], self._constants
 
     def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:

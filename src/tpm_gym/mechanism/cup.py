@@ -86,8 +86,9 @@ CUP = VacuumCup()
 def sealed(lip: Any, axis: Any, position: Any, quaternion: Any, size: tuple[float, float]) -> Any:
     """Return whether the whole lip lies on the top face of a square block, so that it seals.
 
-    Gap and tilt may be up to ``CUP.seal_gap`` and ``CUP.seal_tilt``. If the components are arrays
-    (n,) instead of numbers, the result is an array (n,). Vectors are in the world frame.
+    Gap and tilt may be up to ``CUP.seal_gap`` and ``CUP.seal_tilt``. Vectors are in the world
+    frame. The components of the vectors are numbers or arrays (n,). If they are arrays, the result
+    is an array (n,).
 
     Args:
         lip: Centre of the lip, m.

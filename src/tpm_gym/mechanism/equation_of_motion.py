@@ -181,10 +181,10 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Call the function ``text`` for all rows of the states.
+        """Call the function ``text`` for all rows of the arrays ``states``, (..., 3) each.
 
-        The first of the states is theta. The arguments of ``text`` are the configuration at theta,
-        and then the other states in their order.
+        The first array is theta. The arguments of ``text`` are the configuration at theta, and then
+        the rows of the other arrays, in the arrays' order.
 
         Returns:
             Results of ``text`` for all rows.

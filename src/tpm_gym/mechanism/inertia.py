@@ -68,10 +68,10 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
 
 
 class Bodies:
-    """Moving links by name, with factors of their masses, and a record of the links in use."""
+    """Moving links by name, with factors of mass and inertia, and a record of the links in use."""
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
-        """Set one factor of mass and inertia for each moving link; without factors, all are 1.
+        """Store one factor of mass and inertia for each moving link; 1 if ``factors`` is empty.
 
         Raises:
             ConfigurationError: If the number of factors is wrong.

@@ -36,9 +36,9 @@ _NONE: Final = (0.0, 0.0, 0.0)
 class Equations(NamedTuple):
     """Functions of one mechanism, called by the loops over rows; all of them are compilable.
 
-    Each attribute is given as (arguments) -> results. ``columns`` hold lengths and constants of the
-    machines; functions return the values of row j. ``rates`` and ``changes`` are the first and
-    second derivatives of the joint positions by time.
+    Each attribute is given as (arguments) -> results. ``columns[k, j]`` is parameter k of the
+    machine to which row j belongs: the lengths come first, then the constants of the dynamics.
+    ``rates`` and ``changes`` are the first and second derivatives of the joint positions by time.
 
     Attributes:
         modes: (machine) -> signs of the modes.
@@ -73,7 +73,7 @@ class Equations(NamedTuple):
 
 
 def get(columns: FloatArray, first: int, j: int) -> Triple:
-    """Return the entries of row j in three columns, beginning at column ``first``."""
+    """Return row j of three columns, beginning at column ``first``."""
     return columns[first, j], columns[first + 1, j], columns[first + 2, j]
 
 
@@ -194,21 +194,27 @@ def _loop(row: Callable[..., None], modes_of: Callable[..., Any], size: int, wid
 
 
 def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
-    """Return functions that need only the lengths: {function: number of result columns}."""
+    """Return the functions for kinematics: {function: number of result columns}.
+
+    Of a machine's parameters, these functions use only the lengths.
+    """
     _, lengths, _, posture, pose, position_of, regular, velocity, on_side, *_ = equations
 
     def inverse(block: _Block, j: int) -> None:
-        """Compute joint positions (3) for P."""
+        """Compute the joint positions (3 columns) for P."""
         angles, real = posture(get(block.given, 0, j), block.modes, lengths(block.own, j))
         _put(block.found, 0, j, angles, real)
 
     def forward(block: _Block, j: int) -> None:
-        """Compute P (3) at joint positions, in the modes of the machine."""
+        """Compute P (3 columns) at joint positions, in the modes of the machine."""
         at, _, working = pose(get(block.given, 0, j), block.modes, lengths(block.own, j))
         _put(block.found, 0, j, position_of(at), working)
 
     def evaluate(block: _Block, j: int) -> None:
-        """Compute P (3), J (9), 1/cond(J), and whether the working mode holds, at theta."""
+        """Compute P, J, 1/cond(J), and whether the machine is in its working mode, at theta.
+
+        The results have 3, 9, 1 and 1 columns.
+        """
         g, found = lengths(block.own, j), block.found
         at, there, found[13, j] = pose(get(block.given, 0, j), block.modes, g)
         real, rows = there & regular(at, g), velocity(at)
@@ -254,7 +260,10 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
 
 
 def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
-    """Return functions that need all constants: {function: number of result columns}."""
+    """Return the functions for dynamics: {function: number of result columns}.
+
+    These functions use all parameters of a machine: the lengths and the constants of the dynamics.
+    """
     _, lengths, inertia, _, pose, position_of, regular, velocity, _, torques, gather, masses = (
         equations
     )
@@ -272,7 +281,11 @@ def _dynamics(equations: Equations) -> dict[Callable[..., None], int]:
         _put(block.found, 0, j, (one - a, two - b, three - c), there & regular(at, g))
 
     def motion(block: _Block, j: int) -> None:
-        """Compute P (3), J (9), whether the working mode holds, masses (9) and bias (3)."""
+        """Compute P, J, whether the machine is in its working mode, mass matrix, and bias torques.
+
+        The results have 3, 9, 1, 9 and 3 columns. The bias torques are the torques at zero joint
+        acceleration.
+        """
         g, bodies, found = lengths(block.own, j), inertia(block.own, j), block.found
         at, there, found[12, j] = pose(get(block.given, 0, j), block.modes, g)
         real, rows = there & regular(at, g), velocity(at)

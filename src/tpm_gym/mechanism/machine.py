@@ -193,7 +193,7 @@ class Machine(ABC):
         Args:
             position: Point P (..., 3) m.
             built: Parameters (b, k) of b machines from :meth:`built`; None for the nominal machine.
-                Of m points, point i belongs to machine ``built[i // (m // b)]``. For b machines
+                Of n points, point i belongs to machine ``built[i // (n // b)]``. For b machines
                 with q points each, pass points (b, q, 3).
         """
 
@@ -347,9 +347,9 @@ class Machine(ABC):
         milliseconds for each row.
 
         Args:
-            theta: Joint positions (..., 3).
-            theta_dot: Joint velocities (..., 3) per s.
-            theta_ddot: Joint accelerations (..., 3) per s^2.
+            theta: Joint positions (..., 3) rad (m for a slide).
+            theta_dot: Joint velocities (..., 3) rad/s (m/s for a slide).
+            theta_ddot: Joint accelerations (..., 3) rad/s^2 (m/s^2 for a slide).
             force: Force on P (..., 3) N that the motors hold against; None for no force.
             built: Parameters of the machines, as for :meth:`inverse`.
         """

@@ -15,7 +15,7 @@ from tpm_gym.mechanism.mount import Mount
 from tpm_gym.mechanism.urdf import COLOURS, add, numbers
 
 SOLID = "solid"
-"""Class of geoms that collide; geoms of the other class are only drawn."""
+"""Class of geoms that collide; geoms of the class ``drawn`` do not collide."""
 
 STIFF = "0.9999 0.9999 0.001 0.5 2"
 """Impedance (solimp) of rigid constraints: the largest that MuJoCo accepts. It does not depend on
@@ -85,7 +85,10 @@ def site_names(closure: str) -> tuple[str, str]:
 
 
 def mjcf_text(machine: Machine) -> str:
-    """Write MJCF for MuJoCo without tpm_gym: the robot over a table, with servos as motors."""
+    """Return the MJCF text of the robot over a table, with servos as motors.
+
+    MuJoCo can load this text without tpm_gym.
+    """
     mechanism = machine.mechanism
     root = robot(mechanism, machine.mount, _TIME_STEP)
     root.insert(0, Comment(_NOTES))

@@ -66,7 +66,10 @@ class Motor:
         return self.clearance + self.length / 2 + 2 * self.end_turns
 
     def rotor(self, axis: Axis) -> list[Solid]:
-        """Build the rotor: rings along ``axis`` about the origin; magnets are as dense as steel."""
+        """Build the rotor: two rings about ``axis``, one on each side of the origin.
+
+        The magnets are modelled as steel.
+        """
         size = (self.gap_radius, self.length / 2, 0.0)
         bore = (self.gap_radius - self.ring, self.length / 2, 0.0)
         return [
@@ -75,7 +78,10 @@ class Motor:
         ]
 
     def stator(self, axis: Axis, centre: Vector) -> list[Solid]:
-        """Build the housings along ``axis`` about ``centre``; the shaft projects beyond them."""
+        """Build the two housings about ``axis``, one on each side of ``centre``.
+
+        The shaft projects beyond the housings.
+        """
         size = (self.stator_radius, self.reach - self.clearance - 2 * _FACE, 0.0)
         return [
             Solid("cylinder", size, at, ALUMINIUM, axis=axis, colour="dark")

@@ -39,16 +39,19 @@ class Mount:
             raise ConfigurationError("height", self.height, "at most 100 m")
 
     def to_world(self, point: ArrayLike) -> FloatArray:
-        """Convert points (..., 3) m from the paper frame to the world frame."""
+        """Convert points (..., 3) m from the machine's frame to the world frame."""
         world: FloatArray = self.rotate(point) + np.array([0.0, 0.0, self.height])
         return world
 
     def to_paper(self, point: ArrayLike) -> FloatArray:
-        """Convert points (..., 3) m from the world frame to the paper frame."""
+        """Convert points (..., 3) m from the world frame to the machine's frame."""
         return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
 
     def rotate(self, vector: ArrayLike) -> FloatArray:
-        """Convert free vectors (..., 3), such as velocities, in either direction."""
+        """Convert velocities or other free vectors (..., 3) between paper frame and world frame.
+
+        The conversion is the same in both directions.
+        """
         turned: FloatArray = np.multiply(vector, _HALF_TURN, dtype=np.float64)
         return turned
 
@@ -57,7 +60,7 @@ class Mount:
         """Factors (1 or -1) and origin (m) that convert points to the world frame, (3,) each.
 
         ``world = factors * point + origin``, and ``point = factors * (world - origin)``, where
-        ``point`` is in the paper frame.
+        ``point`` is in the machine's frame.
         """
         return _HALF_TURN, np.array([0.0, 0.0, self.height])
 
@@ -68,16 +71,16 @@ class Mount:
 
     @property
     def free_fall(self) -> Vector:
-        """Acceleration of gravity in the paper frame, m/s^2."""
+        """Acceleration of gravity in the machine's frame, m/s^2."""
         return (0.0, 0.0, GRAVITY)
 
     @property
     def quaternion(self) -> Quaternion:
-        """Orientation of the paper frame in the world, (x, y, z, w)."""
+        """Orientation of the machine's frame in the world, (x, y, z, w)."""
         return (1.0, 0.0, 0.0, 0.0)
 
     @staticmethod
     def tilt(quaternion: Quaternion) -> float:
-        """Compute the angle between an orientation (x, y, z, w) and the paper frame, rad."""
+        """Compute the angle between an orientation (x, y, z, w) and the machine's frame, rad."""
         _, y, z, w = quaternion
         return 2 * math.asin(min(1.0, math.hypot(y, z, w)))

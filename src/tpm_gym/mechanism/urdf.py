@@ -93,7 +93,10 @@ def _text(value: str | float | Iterable[float]) -> str:
 
 
 def loops_text(mechanism: Mechanism) -> str:
-    """Write loop closures and motors as YAML, for the URDF with its closure frames."""
+    """Write loop closures and motors as YAML.
+
+    The text belongs to the URDF that :func:`urdf_text` writes with ``closure_frames=True``.
+    """
     pairs = [[name for name, *_ in _sides(closure)] for closure in mechanism.closures]
     lines = ["# Generated from tpm_gym.mechanism; do not edit (make urdf)."]
     lines += ["# Pairs of frames of the URDF whose origins coincide (3d).", "closed_loop:"]

@@ -38,7 +38,7 @@ def torque(
         mechanism: Bodies.
         joint_positions: Function from the motors' positions to all joint positions.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
-        link_masses: Factors of mass and inertia of the moving links.
+        link_masses: For each moving link, factor by which its mass and inertia are multiplied.
         theta: Positions of the motors (3,), rad or m.
         theta_dot: Velocities of the motors (3,), per s.
         theta_ddot: Accelerations of the motors (3,), per s^2.

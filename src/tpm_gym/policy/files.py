@@ -175,7 +175,7 @@ def files(path: str | Path) -> tuple[Path, Path]:
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256, in hex, of all entries but ``sha256``; order and layout do not count."""
+    """Return the SHA-256, in hex, of a policy's JSON without ``sha256``; order does not count."""
     entries = {name: value for name, value in content.items() if name != "sha256"}
     text = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()
@@ -226,7 +226,10 @@ def published() -> list[str]:
 
 
 def _refused(file: Path, cause: str) -> PolicyFileError:
-    """Return an error. ``cause`` may quote the file, so its text is cut and made printable."""
+    """Return the error for a file that is not a valid policy file.
+
+    The text ``cause`` is cut and made printable, because it may quote the file.
+    """
     reason = f"is not a policy file: {cause[:200].encode('unicode_escape').decode()}"
     remedy = "get an intact copy of both files, export the policy again, or update tpm_gym"
     return PolicyFileError(str(file), reason, remedy)

@@ -26,7 +26,10 @@ from tpm_gym.simulation.vectors import (
 
 @kept
 def all_within(points: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Return whether all points (m, 3) lie in the box low (3,) to high (3,); NaN is outside."""
+    """Return whether all n points (n, 3) lie in the box from ``low`` (3,) to ``high`` (3,).
+
+    A point with NaN lies outside.
+    """
     for row in range(len(points)):
         for axis in range(3):
             if not low[axis] <= points[row, axis] <= high[axis]:
@@ -41,11 +44,11 @@ def shifted(
     """Return points + parts * step, projected into the box from ``low`` to ``high``.
 
     Args:
-        points: (m, 3).
-        parts: (m, 3).
-        step: (3,).
-        low: (3,).
-        high: (3,).
+        points: (n, 3), n points.
+        parts: (n, 3), for each point the factors of ``step`` along the three axes.
+        step: (3,), displacement along each axis for a factor of 1.
+        low: (3,), lower corner of the box.
+        high: (3,), upper corner of the box.
     """
     moved = np.empty_like(points)
     for row in range(len(points)):
@@ -216,12 +219,12 @@ def distances(points: FloatArray, others: FloatArray) -> FloatArray:
 
 @kept
 def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return for each row whether any of its k places is outside its box, (n,).
+    """Return for each row whether a place of the row is outside the box for this place, (n,).
 
     A place with NaN is outside.
 
     Args:
-        places: (n, k, 3).
+        places: (n, k, 3), k places in each row. Box i is for place i of every row.
         low: (k, 3), lowest coordinates in the boxes.
         high: (k, 3), highest coordinates in the boxes.
     """
@@ -365,8 +368,9 @@ def drawn(shares: FloatArray, boxes: FloatArray, counts: IntArray) -> FloatArray
 
     Args:
         shares: (r, k, d, 4) random numbers in [0, 1), four for each candidate. The first three
-            numbers determine the candidate's place in the box. The fourth number of a point's first
-            candidate chooses the box of all its candidates; the other fourth numbers are not used.
+            numbers determine the candidate's place in the box. For each point, the fourth number of
+            the first candidate chooses the box of all candidates for this point; the other fourth
+            numbers are not used.
         boxes: (sum of ``counts``, 2, 3) low and high corners of the boxes: the boxes of the first
             point, then the boxes of the second point, and so on.
         counts: (k,) number of boxes of each point.
@@ -400,7 +404,7 @@ def accepted(
         drawn: (r, k, d, 3) m, d draws for each of the last k points of a row.
         conditioning: (r, k, d) conditioning at the draws.
         least: Smallest conditioning of a chosen draw.
-        most: Upper limit; the conditioning of a chosen draw is smaller.
+        most: Upper limit of the conditioning of a chosen draw; the limit itself is not allowed.
         apart: Smallest distance of a chosen draw from the earlier points of its row, m.
         rows: (r,) indices of the rows of ``points`` for which points are chosen.
         points: (n, j, 3) m, j points of each row; the chosen draws are written to the last k.
@@ -435,7 +439,7 @@ def arrived(
     Args:
         theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
         points: (n, j, 3) m, P at the ends of the last j time steps.
-        push: (n, m, 3) N, force of the objects on P in the last m time steps.
+        push: (n, i, 3) N, force of the objects on P in the last i time steps.
         carried: (n,) kg, masses of the held objects.
         step: Time step, s.
 
@@ -488,7 +492,7 @@ def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
     """Return for each robot whether any of its torques exceeds the motor's largest torque, (r,).
 
     Args:
-        torques: (r, m, 3) N m, torques in m time steps.
+        torques: (r, k, 3) N m, torques in k time steps.
         effort: (r, 3) N m, largest torques of the motors.
     """
     found = np.zeros(len(torques), np.bool_)
@@ -501,7 +505,7 @@ def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
 
 @kept
 def ends(theta: FloatArray, step: float) -> FloatArray:
-    """Compute the motion in the first and in the last time step of a control period.
+    """Compute the motion in the first and in the last of the K time steps of a control period.
 
     Velocities and accelerations are computed from differences of the joint positions in this
     control period only, because the acceleration jumps between control periods.
@@ -556,9 +560,11 @@ def along(
 def braced_inverse(
     mass: FloatArray, stiffness: FloatArray, damping: float, step: float
 ) -> FloatArray:
-    """Return the inverse (n, 6) of mass + step * (step * stiffness + damping) for each robot.
+    """Return the inverse (n, 6) of the matrix M + step * (step * K + damping * I) of each robot.
 
-    The six columns are the entries 00, 01, 02, 11, 12 and 22 of the symmetric inverse.
+    M is the inertia ``mass`` (n, 3, 3) kg m^2, K is the diagonal matrix of ``stiffness`` (n, 3)
+    N m/rad, and I is the unit matrix. The six columns are the entries 00, 01, 02, 11, 12 and 22 of
+    the symmetric inverse.
     """
     inverse = np.empty((len(mass), 6))
     for row in range(len(mass)):
@@ -587,8 +593,9 @@ def servo_torques(
         index: Index of the time step in the control period.
         references: References of the control period.
         law: Stiffness (n, 3) N m/rad, damping (N m s/rad), inertia (n, 3, 3) kg m^2 that the law
-            assumes, :func:`braced_inverse` of the inertia, largest torques (n, 3) N m, and corner
-            and no-load speed of each motor (3, 2) rad/s.
+            assumes, :func:`braced_inverse` of the inertia, largest torques (n, 3) N m, and two
+            speeds of each motor (3, 2) rad/s: the corner speed, above which the largest torque
+            falls, and the no-load speed, at which it is zero.
         theta: (n, 3) rad, at the beginning of the time step.
         theta_dot: (n, 3) rad/s, at the beginning of the time step.
         step: Time step, s.

@@ -1,8 +1,9 @@
 """Interface of engines, and the registry of engines by name.
 
 An engine simulates n robots, each over its own table. Engines know machine, scene and drive, but
-no goals, rewards or Gymnasium. Encoder errors, modes and the State are computed for all engines in
-:mod:`tpm_gym.simulation.simulation`.
+no goals, rewards or Gymnasium. For all engines, :mod:`tpm_gym.simulation.simulation` adds encoder
+errors to the readings, records the modes that robots leave, and computes the
+:class:`~tpm_gym.simulation.state.State`.
 """
 
 from __future__ import annotations
@@ -135,7 +136,11 @@ class Readout(NamedTuple):
 
 
 def spline_weights(steps: int) -> FloatArray:
-    """Return weights (steps, 3) of the last three commands, oldest first, after each time step."""
+    """Return the weights (steps, 3) that give the path's point at the end of each time step.
+
+    This point is the sum of the last three commands, each multiplied by its weight. Each row
+    is for one time step; its first weight is for the oldest command.
+    """
     s = np.arange(1, steps + 1) / steps
     return np.stack([(1 - s) ** 2, 1 + 2 * s - 2 * s**2, s**2], axis=1) / 2
 
@@ -152,7 +157,7 @@ class Path:
     Args:
         machine: Nominal machine, used for the inverse kinematics.
         commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
-        weights: (K, 3), from :func:`spline_weights`.
+        weights: (K, 3), from :func:`spline_weights`, for the K time steps of the control period.
         bias: (n, 3) rad, encoder reading minus true joint position; None for zero.
 
     Methods that return joint positions raise JointLimitError if a motor would be beyond a stop, and
@@ -191,7 +196,7 @@ class Path:
         return theta if self._bias is None else self.true(theta)
 
     def readings(self) -> FloatArray:
-        """Return encoder readings (n, K + 1, 3) rad, from beginning to end of the period."""
+        """Return encoder readings (n, K + 1, 3) rad at the start and after each of K time steps."""
         return self._readings(np.concatenate([_START, self.weights]))
 
     def _readings(self, weights: FloatArray) -> FloatArray:
@@ -211,7 +216,10 @@ class Path:
 
 @cache
 def loops() -> ModuleType:
-    """Import the compiled loops, :mod:`tpm_gym.simulation.compiled`, which import Numba."""
+    """Import and return :mod:`tpm_gym.simulation.compiled`, a module of compiled functions.
+
+    The module imports Numba, so it is imported only when its functions are needed.
+    """
     from tpm_gym.simulation import compiled
 
     return compiled
@@ -307,8 +315,8 @@ class Engine(Protocol):
     def save(self) -> Any:
         """Return the state that the next time steps depend on, as plain data or arrays.
 
-        The result does not include state that cannot be read, such as contact impulses of the last
-        time step. ``restore`` resets this state.
+        The result does not include values that cannot be read from the engine, such as contact
+        impulses of the last time step. ``restore`` resets these values.
         """
 
     def restore(self, saved: Any) -> None:
@@ -448,6 +456,6 @@ _PARTS = [name for name in (*Engine.__annotations__, *vars(Engine)) if not name.
 
 
 def _has(engine: Engine, part: str) -> bool:
-    """Return whether an engine has an attribute that it does not inherit from the protocol."""
+    """Return whether ``engine`` has the attribute ``part`` without inheriting it from Engine."""
     own = getattr(engine, part, None)
     return own is not None and getattr(own, "__func__", None) is not vars(Engine).get(part, own)

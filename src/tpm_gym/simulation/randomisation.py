@@ -121,9 +121,9 @@ class Randomisation:
         encoder_bias: Largest bias of each encoder, rad; at most 0.001. The drive follows the
             encoder, so the true joint position has the opposite error.
         latency: Delay of the actions in control steps, at most 5.
-        length_error: Largest error of each of l1 to l7, m; at most 0.001. PyBullet and MuJoCo then
-            rebuild the robot at each reset, which makes a reset several times slower. PyBullet
-            leaks about 13 kB of memory per rebuild.
+        length_error: Largest error of each of l1 to l7, m; at most 0.001. If this value is above 0,
+            PyBullet and MuJoCo rebuild the robot at each reset, which makes a reset several times
+            slower. PyBullet leaks about 13 kB of memory per rebuild.
 
     If the plant is not nominal, actions at full speed towards a corner of the region near y = 0
     can move the platform through the singularity. The State reports this. With random actions and

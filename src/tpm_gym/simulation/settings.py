@@ -15,12 +15,16 @@ _SHORTEST = 1e-6  # s; a control step with a shorter time step would take minute
 
 
 def settings_of(kind: type[T], name: str, value: Any) -> T:
-    """Convert an instance of ``kind``, a mapping of its fields, or None to an instance.
+    """Return ``value`` as an instance of ``kind``.
 
-    None gives the defaults.
+    Args:
+        kind: Dataclass of settings.
+        name: Name of the option in error messages.
+        value: An instance of ``kind``, a mapping of its fields, or None for the defaults.
 
     Raises:
-        ConfigurationError: If ``value`` is none of these, has unknown keys, or is out of range.
+        ConfigurationError: If ``value`` is none of these, or has an unknown field or a field that
+            is out of range.
     """
     if isinstance(value, kind):
         return value

@@ -1,7 +1,7 @@
 """Simulation of n robots with any engine.
 
-The engine simulates the robots. This module adds encoder errors, records the modes that were left,
-and computes the State.
+The engine simulates the robots. This module adds encoder errors, records which robots have left
+their assembly mode or working mode, and computes the State.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from tpm_gym.simulation.state import CONTROL_PERIOD, Scene, State
 CLOSURE_LIMIT = 0.005
 """Largest allowed gap at a loop closure, m."""
 
-_STEPS = 10  # time steps in a control period other than 40 ms, if the settings have none
+_STEPS = 10  # time steps of a control period other than 40 ms, if the settings have no time step
 
 _BLUR = 0.05
-"""Distance of P from the plane of symmetry at which the observed velocity is halved.
+"""Distance between P and the machine's plane of symmetry, as a fraction of a step limit.
 
-The plane is normal to the machine's ``mirror_axis``, and the distance is a fraction of the
-machine's ``step_limit`` along this axis. At this distance, the observed velocity normal to the
-plane is half of the velocity J theta_dot; in the plane, it is zero.
+If P is at this distance, the observed velocity of P normal to the plane is half of the component of
+J theta_dot normal to the plane. If P is in the plane, this observed velocity is zero. The plane is
+normal to ``mirror_axis``. The step limit is the machine's ``step_limit`` along this axis.
 """
 
 _COLUMNS = (
@@ -52,7 +52,7 @@ _COLUMNS = (
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Saved state of a :class:`Simulation`, which determines all next steps.
+    """Saved state of a :class:`Simulation`; the state determines all later steps.
 
     Attributes:
         plants: Plant of each of the n robots.
@@ -77,8 +77,9 @@ class Simulation:
         engine: Name of the engine.
         count: Number of robots, n.
         control_period: Time between two commands, s.
-        physics: Numerical settings of the engine; None for the engine's defaults. A control period
-            other than 40 ms has ten time steps, unless the settings have a time step.
+        physics: Numerical settings of the engine; None for the engine's defaults. If the settings
+            have no time step, a control period of 40 ms has time steps of the engine's default
+            length, and any other control period is divided into ten time steps.
         drive: Servo drives of the motors; None for ideal drives.
         gui: Whether to open a window.
         renderer: Renderer of the pictures; None for the engine's default.
@@ -267,7 +268,10 @@ class Simulation:
 
     @property
     def mode_left(self) -> NDArray[np.int8]:
-        """Mode that each robot left in this episode, (n,): 0 none, 1 assembly, 2 working."""
+        """First mode that each robot has left in this episode, (n,).
+
+        0 stands for no mode, 1 for the assembly mode, 2 for the working mode.
+        """
         self.state()
         return self._mode_left
 
@@ -331,15 +335,15 @@ class Simulation:
     def _mirrored(
         self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Mirror P (n, 3) m and J (n, 3, 3) of robots beyond the mirror plane, seen from home.
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots that are not on home's side of a plane.
 
-        The plane is normal to ``mirror_axis``. A position of P and its mirror image have the same
-        joint positions, so encoders do not show on which side of the plane P is. The sign of a
+        This mirror plane is normal to ``mirror_axis``. A point P and its mirror image have the
+        same joint positions, so encoders do not show on which side of the plane P is. The sign of a
         passive joint's position shows the side. A switch would measure this sign on a real robot.
 
-        P may turn back at the plane although its commands lead through the plane. Then the path
-        ends on one side of the plane, and P is on the other side. So the commands are mirrored to
-        P's side. This does not change the joint positions on the path.
+        P may turn back at the plane although its commands lead through the plane. Then P stays on
+        the near side, but the path of its commands ends on the far side. So the commands are
+        mirrored to the near side. This does not change the joint positions on the path.
 
         Args:
             truth: (n, 3) m, P of the platform, world.

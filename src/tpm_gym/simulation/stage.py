@@ -57,8 +57,8 @@ def boards(table: tuple[float, float], belt: Belt | None) -> list[tuple[Slab, fl
         belt: Belt of the scene.
 
     Raises:
-        ConfigurationError: If the belt's lowest x is on the table, or its highest x is not on the
-            table.
+        ConfigurationError: If the belt's lowest x is greater than the table's lowest x, or the
+            belt's highest x is not on the table.
     """
     edge = table[0]
     if belt is None:

@@ -20,7 +20,8 @@ class Block:
     """Box with a square base, the object of a task.
 
     Objects are boxes because engines find all four contacts of a box with the table in one time
-    step. For a cylinder, they find only one to three, and the rest of its rim sinks into the table.
+    step. For a cylinder, they find only one to three contacts, and the rim sinks into the table
+    where it has no contact.
 
     Attributes:
         name: Key in ``reset(options=...)``; unique in its scene.

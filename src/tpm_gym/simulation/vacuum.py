@@ -2,8 +2,8 @@
 
 The pressure in the cup approaches the ejector's pressure (vacuum on) or the ambient pressure
 (vacuum off) exponentially. The object is lost when the load exceeds the force that vacuum and lip
-friction can transmit. The engine computes the load, and finds the object that the lip touches with
-:func:`tpm_gym.mechanism.cup.sealed`.
+friction can transmit. The engine computes the load. It also calls
+:func:`tpm_gym.mechanism.cup.sealed` to find the object that the lip touches.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def holds(vacuum: Any, load: tuple[Any, Any]) -> Any:
 def hold_after(hold: Hold, time_step: float, on: bool, load: Load, touched: int) -> Hold:
     """Compute held object and vacuum after a time step.
 
-    A cup that has lost an object can hold one again after it is vented.
+    A cup that has lost an object can hold an object again only after the vacuum has fallen to
+    ``CUP.least_vacuum``.
 
     Args:
         hold: Held object and vacuum in the time step.

@@ -1,4 +1,4 @@
-"""Check of a task: it can start, and computes equal results for states in a batch and alone."""
+"""Check that a task can start, and that a state has equal results alone and in a batch."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _OWN_ROW = (
 
 
 def check(task: Task, taken: Sequence[str] = ()) -> None:
-    """Check that a task can start, and computes equal results for states in a batch and alone.
+    """Check that a task can start, and that a state has equal results alone and in a batch.
 
     A task cannot start if the machine has no room for it, or has no tempting goals (just above the
     threshold of safe conditioning) although ``goals`` is ``"tempting"``. A method that reduces over

@@ -84,7 +84,7 @@ class CartesianControl:
         return float((np.abs(wanted - current) / self._step).max())
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide by the step limit."""
+        """Divide the points by the step limit."""
         return points / self._step
 
     def rate(self, points: FloatArray) -> FloatArray:
@@ -97,8 +97,8 @@ class JointControl:
 
     An action of 1 moves a joint by the machine's ``joint_limit``, scaled to the control period. The
     increment is scaled down as a whole if it would move P farther than the step limit, or into a
-    posture that cannot be assembled. (This is frequent along y, where small turns of the joints
-    move the platform far.) A command beyond the region is projected into it.
+    posture that cannot be assembled. (Many increments exceed the step limit along y, because small
+    turns of the joints move P far along y.) A command beyond the region is projected into it.
     """
 
     name = "joints"
@@ -146,10 +146,11 @@ class JointControl:
     ) -> FloatArray:
         """Shorten the increment so that P moves by almost the step limit; return P (r, 3) m.
 
-        ``excess`` is the displacement at ``share``. The secant through two tries gives the next
-        try. (Dividing ``share`` by the displacement alone converges slowly next to the serial
-        singularity, where the displacement is not proportional to the share.) Next to a parallel
-        singularity, it can happen that all tries exceed the limit; P then stays where it is.
+        ``excess`` is P's displacement at ``share``, in units of the step limit. The secant through
+        two tries gives the next try. (If every try only divided ``share`` by ``excess``, the search
+        would converge slowly next to the serial singularity, where the displacement is not
+        proportional to the share.) Next to a parallel singularity, it can happen that all tries
+        exceed the limit; P then stays where it is.
         """
         point, low, high = current, np.zeros_like(share), share
         before, was = np.zeros_like(share), np.zeros_like(share)
@@ -183,12 +184,12 @@ class JointControl:
         return float(max(turns / self._turn, axes))
 
     def scaled(self, points: FloatArray) -> FloatArray:
-        """Divide the joint positions by the joint limit."""
+        """Compute the joint positions, divided by the joint increment of an action of 1."""
         places: FloatArray = self._machine.inverse(points) / self._turn
         return places
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Multiply J by the joint limit."""
+        """Compute J, multiplied by the joint increment of an action of 1."""
         theta = self._machine.inverse(points)
         rate: FloatArray = self._machine.evaluate(theta).jacobian * self._turn
         return rate
@@ -219,12 +220,12 @@ class Follower:
         self._most = USABLE * np.array([motor.effort for motor in machine.mechanism.motors])
 
     def limit(self, wanted: FloatArray, current: FloatArray, before: FloatArray) -> FloatArray:
-        """Return the commands (n, 3) m near ``wanted`` that can be followed.
+        """Return commands (n, 3) m close to ``wanted`` that the motors can follow.
 
         Args:
-            wanted: (n, 3) m, commands of a control.
+            wanted: (n, 3) m, the next commands, before they are limited.
             current: (n, 3) m, the last commands.
-            before: (n, 3) m, the commands before the last.
+            before: (n, 3) m, the commands before ``current``.
         """
         last, change, brake = current - before, self._change, self._brake
         step = np.clip(wanted - current, last - change, last + change)
@@ -245,7 +246,11 @@ class Follower:
         return commands
 
     def feasible(self, before: FloatArray, current: FloatArray, then: FloatArray) -> BoolArray:
-        """Return whether the motors' peak torques allow the spline of three commands, (n,)."""
+        """Return an array (n,): whether the motors' peak torques suffice in the middle of a path.
+
+        The control points of the path are the commands ``before``, ``current`` and ``then``, each
+        (n, 3) m.
+        """
         (torques,) = np.abs(self._torques(before, current, then[None]))
         enough: BoolArray = (torques <= self._most / USABLE).all(axis=-1)
         return enough

@@ -29,7 +29,7 @@ SHARE: Final = 0.55
 EDGE: Final = 0.030
 """Smallest distance of goals from the end of the belt, m."""
 CLEARANCE: Final = 0.028
-"""Height over start and goal from which the cup comes down, and to which it goes up again, m."""
+"""Height over start and goal, m: the cup comes down from this height, and goes up to it again."""
 UP: Final = np.array([0.0, 0.0, -CLEARANCE])  # paper z points down
 SEALING: Final = 4
 """Largest number of control steps for which the cup follows the block until the cup seals."""
@@ -123,7 +123,7 @@ class Conveyor(Task):
         return [(low, high)]
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, of each block, and of the belt."""
+        """Return the entries of the observation vector: of the robot, each block, and the belt."""
         middle, half = sum(SPEEDS) / 2, (SPEEDS[1] - SPEEDS[0]) / 2
         meaning = "speed of the belt, by its encoder"
         speed = Entry("belt_speed", "m/s", meaning, (middle,), (half,), _belt_speed)
@@ -149,7 +149,7 @@ class Conveyor(Task):
     def _deliver(
         self, camera: _Camera, goal: FloatArray, leave: list[FloatArray]
     ) -> Iterator[Move]:
-        """Meet a block on the belt, pick it up while both move, and put it into the tray."""
+        """Follow a block on the belt with the cup, pick the block up, and put it into the tray."""
         motion, name = camera.motion, camera.block.name
         while True:
             yield from self._pick(camera, leave)
@@ -202,7 +202,7 @@ class _Camera:
         return self.motion.machine.mount.rotate(way)
 
     def place(self) -> FloatArray:
-        """Return the block's present centre (3,) m, world: as seen, plus the motion since then."""
+        """Return the block's present centre (3,) m, world, from the last picture and belt speed."""
         steps = len(self._trail) - 1
         if self._seen("velocity")[0] > self.motion.seen["belt_speed"][0] / 2:
             steps = self._task.camera_delay

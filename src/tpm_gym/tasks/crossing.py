@@ -25,8 +25,8 @@ STRIPE: Final = 0.003
 class Crossing(Task):
     """Bring point P to a goal on the other side of y = 0, and stop there.
 
-    In the plane y = 0, a parallel singularity, no torque of the motors acts along y, and P cannot
-    go around the plane. So P has to pass the plane by inertia. The torques stay finite only if the
+    The plane y = 0 is a parallel singularity: there, no torque of the motors acts along y. P cannot
+    go around the plane, so P has to pass it by inertia. The torques stay finite only if the
     velocity along y is constant there. The mechanism changes its assembly mode, which does not end
     the episode. If P is too slow, or if commands accelerate it along y in the plane, P turns back;
     the command is then mirrored to the side of P.

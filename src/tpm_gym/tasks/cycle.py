@@ -23,7 +23,7 @@ __all__ = ["Cycle"]
 
 STROKE: Final = 0.305
 RISE: Final = 0.025
-"""Size of the way of P, m: STROKE along x; RISE up at one end and down at the other end."""
+"""Size of P's path, m: P moves up by RISE, by STROKE along x, and down by RISE."""
 BLEND: Final = 0.050
 """Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
 
@@ -34,38 +34,38 @@ SPEED: Final = 5.0
 PAYLOAD: Final = 0.1
 """Payload if the machine has none, kg."""
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
-"""Largest RMS torque of the plan, as a share of the peak torque; 2% are a reserve for servos."""
+"""Largest RMS torque of a plan, as a share of the peak torque; 0.98 leaves a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Acceleration limits (x, y, z), as shares of P's largest acceleration along that axis alone."""
+"""Acceleration limits along x, y, z: shares of P's largest acceleration along each axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
 """Decelerations before the ends of the region, as shares of the accelerations.
 
-Along x, the way ends close to the end of the region; along z, far from it. The motors must be able
-to brake along x and z at the same time.
+Along x, the path ends close to the end of the region; along z, far from it. The motors must be
+able to brake along x and z at the same time.
 """
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth, m, at which the reward term is -1: depth of P below the gate minus the tolerance."""
+"""Depth, m. If P is below the gate-shaped way by tolerance + UNIT, the reward term "gate" is -1."""
 POINTS: Final = 120
 SHOWN: Final = 12
-"""Number of points of the gate between two markers."""
+"""Number of points of the path between two markers."""
 _DRAWS: Final = 1000
 
 
 class Cycle(Task):
     """Carry a payload 25 mm up, 305 mm across and 25 mm down, as fast as the motors can.
 
-    This way is one half of the cycle by which industry compares pick-and-place robots; the other
+    This path is one half of the cycle by which industry compares pick-and-place robots; the other
     half leads back. P starts at rest at one end and has to stop at the other end, within 2 mm. The
-    direction and the y of the way are drawn for each episode. The way has the shape of a gate, with
-    corners that are rounded over 50 mm. The reward has a term for every step in which P is more
-    than 2 mm below this gate.
+    direction and the y of the path are drawn for each episode. The path has the shape of a gate,
+    with corners that are rounded over 50 mm. The reward has a term for every step in which P is
+    more than 2 mm below this path.
 
-    Actions come every 4 ms. The command moves at up to 5 m/s. If a change of its velocity would
-    need more than 95% of the peak torque by closed-form dynamics, the change is reduced. A gripper
-    holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could not: it holds 12 N,
-    and 0.1 kg needs up to 15 N here.
+    Actions come every 4 ms. The command moves at up to 5 m/s. A change of the command's velocity is
+    reduced if, according to closed-form dynamics, the change needs more than 95% of the peak
+    torque. A gripper holds the payload, 0.1 kg or the machine's ``payload``. The vacuum cup could
+    not hold the payload: the cup holds 12 N, and 0.1 kg needs up to 15 N here.
     """
 
     scene = Scene(markers=POINTS // SHOWN + 1, marker_radius=0.004)
@@ -75,7 +75,7 @@ class Cycle(Task):
     max_episode_steps = 75
 
     def __init__(self, machine: Machine, *args: Any, **options: Any) -> None:
-        """Check that the way fits into the machine's region; see the base class."""
+        """Check that the path fits into the machine's region; see the base class."""
         low, high = machine.region.low, machine.region.high
         self._ends = (low[0] + high[0]) / 2 + STROKE / 2 * np.array([-1.0, 1.0])
         self._level = machine.home[2]
@@ -114,17 +114,17 @@ class Cycle(Task):
         limits: FloatArray = np.array(SHARES) * most
         return limits
 
-    # -- the way ------------------------------------------------------------------------------
+    # -- the path -----------------------------------------------------------------------------
 
     def _height(self, way: FloatArray) -> FloatArray:
-        """Return the height of the gate, m, at distances ``way`` (...,) m from an end along x."""
+        """Return the height of the path, m, at distances ``way`` (...,) m along x from one end."""
         to_end = np.minimum(way, STROKE - way)
         share = np.clip(1 - to_end / BLEND, 0.0, 1.0)  # 1 beyond the ends, where the height is 0
         height: FloatArray = RISE * np.cbrt(1 - share**3)
         return height
 
     def gate(self, y: float, backwards: bool = False) -> FloatArray:
-        """Return points (POINTS + 1, 3) m of the way at equal distances, machine's frame."""
+        """Return points (POINTS + 1, 3) m of the path at equal distances, machine's frame."""
         # Points of the corner at equal angles of the Lame curve, then the straight part.
         angle = np.linspace(0.0, np.pi / 2, 200)
         way, height = BLEND * (1 - np.cos(angle) ** (2 / 3)), RISE * np.sin(angle) ** (2 / 3)
@@ -137,7 +137,7 @@ class Cycle(Task):
         return points[::-1] if backwards else points
 
     def markers(self, goal: FloatArray) -> FloatArray:
-        """Return points (k, 3) m of the gate, world."""
+        """Return points (k, 3) m of the gate-shaped path, world."""
         y = float(self.machine.mount.to_paper(goal)[1])
         points: FloatArray = self.machine.mount.to_world(self.gate(y)[::SHOWN])
         return points
@@ -152,7 +152,7 @@ class Cycle(Task):
         return {"goal": np.array(goals), **chosen}
 
     def _draw(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a goal (3,) m: one end of the way, with a y at which the whole way is safe."""
+        """Draw a goal (3,) m: one end of the path, with a y at which the whole path is safe."""
         low, high = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
 
         def draw(rng: np.random.Generator) -> FloatArray:
@@ -171,7 +171,7 @@ class Cycle(Task):
         return goal
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the box of all goals at each end of the way: low and high corner (3,) m, world."""
+        """Return the box of all goals at each end of the path: low, high corner (3,) m, world."""
         del block
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []
@@ -181,7 +181,7 @@ class Cycle(Task):
         return boxes
 
     def departures(self, goals: FloatArray) -> FloatArray:
-        """Return the end opposite to each goal, (r, 3) m, machine's frame."""
+        """Return the starts of P: the other end of each goal's path, (r, 3) m, machine's frame."""
         points: FloatArray = self.machine.mount.to_paper(goals).copy()
         points[:, 0] = self._ends.sum() - points[:, 0]
         return points
@@ -192,14 +192,14 @@ class Cycle(Task):
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return -(d - tolerance) / 5 mm, at most 0; d is the depth of P below the gate."""
+        """Return -(d - tolerance) / 5 mm, at most 0; d is the depth of P below the path."""
         points = self.machine.mount.to_paper(state.fk_position)
         height = self._height(points[:, 0] - self._ends[0])
         below = height - (self._level - points[:, 2]) - self.tolerance
         return {"gate": np.minimum(-below / UNIT, 0.0)}
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Follow the gate at the highest speed that the motors can repeat without overheating."""
+        """Follow the gate as fast as possible; repeating this must not overheat the motors."""
         start, goal = motion.command, self.machine.mount.to_paper(motion.goal)
         path = self.gate(start[1], backwards=bool(start[0] > goal[0]))
         times, _ = timed(self.machine, path, CONTINUOUS * self._peak, USABLE * self._peak)

@@ -29,7 +29,7 @@ class Expert:
 
     Args:
         env: A :class:`~tpm_gym.TPMEnv`, wrapped or not, or a :class:`~tpm_gym.TPMVectorEnv`. The
-            expert reads its task, control, latency and count of episodes, and nothing else.
+            expert reads only the environment's task, control, latency and number of episodes.
 
     Raises:
         InputError: If ``env`` is no such environment.
@@ -59,7 +59,8 @@ class Expert:
 
         Raises:
             EpisodeError: If no episode is running, or a plan has no moves.
-            ConfigurationError: If a plan needs the vacuum or an entry that the task lacks.
+            ConfigurationError: If a plan needs the vacuum or an entry of the observation, and the
+                task does not have it.
         """
         _ = self._env.state  # raises without an episode
         self._look(observation)

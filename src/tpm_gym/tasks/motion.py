@@ -28,9 +28,9 @@ It is larger than the error of single precision, 1e-6.
 SEALING = 0.160
 """Time to wait for the cup to seal before giving up, s."""
 SLOW_ABOVE = CUP.seal_gap + 0.001
-"""Height of the lip over a block, m; a gentle pick moves slowly below this height."""
+"""Height of the lip above a block, m; a gentle pick moves slowly below this height."""
 SLOW_SPEED = 0.025
-"""Speed of a gentle pick while the lip is lower than ``SLOW_ABOVE`` over the block, m/s."""
+"""Speed of a gentle pick, m/s, while the lip is less than ``SLOW_ABOVE`` above the block."""
 
 
 def hanging(block: Block) -> FloatArray:
@@ -149,11 +149,11 @@ class Motion:
     def _overlapped(self, ways: list[FloatArray]) -> FloatArray:
         """Return the fractions (n, k) of k ways that P has covered after each of n control steps.
 
-        P follows the ways one after the other. Each way begins while the way before it slows down.
-        The sum of the speeds of these two ways does not exceed the largest speed of one way.
+        P follows the ways one after the other. Each way begins while P slows down on the previous
+        way. The sum of the speeds of these two ways does not exceed the largest speed of one way.
 
         Args:
-            ways: For each way, the covered fractions by :meth:`trapezoid`.
+            ways: For each way, the fractions that :meth:`trapezoid` returns.
         """
         lengths = np.array([len(way) for way in ways])
         begins = np.cumsum([0, *np.maximum(lengths[:-1] - self._ramp + 1, 0)])

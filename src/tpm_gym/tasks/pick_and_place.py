@@ -17,7 +17,7 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["PickAndPlace"]
 
 CLEARANCE = 0.028
-"""Height over start and goal from which the cup comes down, and to which it goes up again, m.
+"""Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 
 The height is no multiple of the tolerance, so that rounding errors do not decide about success.
 """
@@ -58,7 +58,7 @@ class PickAndPlace(Task):
 
     @cached_property
     def _regions(self) -> dict[str, list[Region]]:
-        """Regions of P while the cup holds the block: at a start ("object"), at a goal ("goal")."""
+        """Regions of P with the block in the cup; key "object": at starts, key "goal": at goals."""
         table = self.on_table(self.block)
         x, y, level = table.high
         air = Region(self.machine.goal_region.low, (x, y, level - sampling.APART))

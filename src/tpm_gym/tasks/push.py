@@ -110,7 +110,7 @@ class Push(Task):
         return point
 
     def observed(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, then those of the block, which include its rotation."""
+        """Return the entries of the observation: the robot's, then the block's with rotation."""
         return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:

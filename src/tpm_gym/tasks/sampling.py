@@ -41,9 +41,10 @@ __all__ = [
 APART: Final = 0.030
 """Smallest distance from start to goal, m, so that no episode starts with success."""
 BAND: Final = 0.004
-"""Largest difference between the conditioning of a tempting start or goal and the threshold.
+"""Largest amount by which the conditioning of a tempting start or goal exceeds the threshold.
 
-On the paper's machine, a displacement of about 1 mm along y changes the conditioning by as much.
+On the paper's machine, a displacement of about 1 mm along y changes the conditioning by this
+amount.
 """
 
 _DRAWS: Final = 4  # points in a call; nearly every row then needs only one call
@@ -63,15 +64,15 @@ def safe_points(
     """Draw safe points of regions, by name, at least ``apart`` (m) from each other.
 
     Args:
-        rngs: One for each of r rows.
+        rngs: One generator for each of the r robots.
         machine: Machine that defines the safe points.
         regions: For each name, the region of its point, or several regions that are equally likely.
-        known: Points (3,) or (r, 3) m that are not drawn, by name.
+        known: Given points by name, (3,) or (r, 3) m each. They are not drawn.
         apart: Smallest distance, m.
         near_singularity: Whether the points must be just above the threshold of safe conditioning.
 
     Returns:
-        The known and the drawn points, (r, 3) m each.
+        The known and the drawn points by name, (r, 3) m each.
 
     Raises:
         ConfigurationError: If no draw meets these conditions.
@@ -111,19 +112,21 @@ def safe_draw(
     draw: Callable[[np.random.Generator], FloatArray],
     ways: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
-    """Draw points, and return the first one, (3,), for which the whole way of P is safe.
+    """Draw points, and return the first point (3,) whose way is safe at all corners.
+
+    The way of a point is a sequence of straight lines along which P will move.
 
     Args:
-        rng: Generator of the row.
+        rng: Generator of the episode that will start.
         machine: The machine.
         goals: ``"tempting"`` if the lowest conditioning on the way must be just above the threshold
             of safe conditioning.
         draw: Function that draws any number d of points, (d, 3).
-        ways: Function that returns the way of P for each of these points, as corners (d, k, 3) m,
+        ways: Function that returns the way of each of these points, as k corners (d, k, 3) m,
             machine's frame. Ways are straight between their corners.
 
     Raises:
-        ConfigurationError: If no draw has such a way.
+        ConfigurationError: If no point with such a way was found.
     """
     least, most = _limits(machine, goals == "tempting")
     for _ in range(_ATTEMPTS):
@@ -165,7 +168,7 @@ def tempting(
     of the line in joint space between them is below the threshold.
 
     Args:
-        rngs: One for each row.
+        rngs: One generator for each of the r robots.
         machine: The machine.
         start: Region of the starts, or the start itself.
         goals: Equally likely regions of the goals.
@@ -211,7 +214,7 @@ def line_in_joints(machine: Machine, start: ArrayLike, end: ArrayLike) -> FloatA
 def at_threshold(
     rng: np.random.Generator, machine: Machine, region: Region, count: int
 ) -> FloatArray:
-    """Draw points (count, 3) of a region, just above the threshold of safe conditioning.
+    """Draw points (count, 3) with a conditioning just above the safe threshold, from a region.
 
     Raises:
         ConfigurationError: If no draw was near the threshold.
@@ -225,7 +228,7 @@ def at_threshold(
 
 
 def _at_the_threshold(rng: np.random.Generator, machine: Machine, region: Region) -> FloatArray:
-    """Draw points from ``region``, and return those just above the threshold, (n, 3)."""
+    """Draw points; return those with a conditioning just above the safe threshold, (n, 3)."""
     points = rng.uniform(region.low, region.high, (_BATCH, 3))
     conditioning, (low, high) = machine.conditioning_at(points), _limits(machine, True)
     chosen: FloatArray = points[(conditioning >= low) & (conditioning < high)]

@@ -17,12 +17,12 @@ from tpm_gym.tasks.task import Task, dense
 __all__ = ["Stack"]
 
 CLEARANCE: Final = 0.045
-"""Height over start and goal from which the cup comes down, and to which it goes up again, m.
+"""Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 
 At this height, a carried block passes above a standing block.
 """
 APART: Final = 0.045
-"""Smallest distance between the centres of the blocks and of the goal on the table, m."""
+"""Smallest distance between any two of lower block, upper block and goal (their centres), m."""
 CLEAR: Final = 0.0005
 """Smallest gap between the two blocks at the start, m."""
 

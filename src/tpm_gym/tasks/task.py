@@ -53,7 +53,7 @@ class Entry:
         centre: Value that is stored as 0.
         scale: Difference that is stored as 1.
         source: Function that reads values (n, ...) from a state. Adjacent entries may share it.
-        columns: The entry's columns (start, stop) of the source's result; None for all.
+        columns: Columns (start, stop) of this entry in the result of ``source``; None for all.
     """
 
     name: str
@@ -87,8 +87,8 @@ class Task(ABC):
         control_period: Time between two actions, s. The machine's limits are for 40 ms, and are
             scaled to this time. For a shorter time, set :attr:`accelerations`: without it, the
             commands can need more torque than the motors have, and shields cannot be used.
-        accelerations: Limits of the command's acceleration, and of its deceleration before the
-            ends of the region, along x, y, z, machine's frame, m/s^2; None for no limits.
+        accelerations: Limits along x, y, z of the machine's frame, m/s^2: largest acceleration of
+            the command, and its deceleration before an end of the region; None for no limits.
         max_episode_steps: Control steps after which ``gym.make`` truncates an episode.
         camera_delay: Control steps by which observation and achieved goal show objects late.
         entries: Entries of the observation vector, in order.
@@ -157,7 +157,7 @@ class Task(ABC):
                 raise ConfigurationError(f"{label}, scale", entry.scale, "numbers other than 0")
         self._centre = np.concatenate([entry.centre for entry in self.entries])
         self._scale = np.concatenate([entry.scale for entry in self.entries])
-        # The source of adjacent entries is read only once.
+        # A source that adjacent entries share is called only once.
         groups = groupby(self.entries, key=lambda entry: entry.source)
         self._sources = [(source, _columns(list(entries))) for source, entries in groups]
 
@@ -167,7 +167,7 @@ class Task(ABC):
         return {name: value for name, value in own if name not in ("entries", "_sources")}
 
     def __setstate__(self, values: dict[str, Any]) -> None:
-        """Restore the attributes, and rebuild the entries."""
+        """Restore the attributes, and rebuild the entries of the observation vector."""
         vars(self).update(values)
         self._set_entries()
 
@@ -182,8 +182,8 @@ class Task(ABC):
         Args:
             rngs: A generator for each episode. An episode draws from its own generator only, so
                 that its values do not depend on the other episodes.
-            chosen: Entries (r, ...) that the user has chosen, within reach. They are returned
-                unchanged, and sampled entries keep clear of them.
+            chosen: Values by name, (r, ...) each, that the user has chosen, within reach. The
+                result contains them unchanged, and sampled positions keep clear of them.
 
         Returns:
             Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. With a
@@ -199,7 +199,7 @@ class Task(ABC):
         return places.reshape(len(places), -1) if self.scene.objects else state.fk_position
 
     def plan(self, motion: Motion) -> Iterator[Move]:
-        """Yield the expert's moves for one robot; the expert repeats the last move.
+        """Yield the expert's moves for one robot; the last move is repeated to the episode's end.
 
         Raises:
             ConfigurationError: If the task has no plan.
@@ -241,7 +241,7 @@ class Task(ABC):
         return {"goal": goal, "singularity": singularity, **self.shaping(state)}
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the goal term (...,) for a gap (...,) m; in a sparse reward, NaN gives -1."""
+        """Return the goal term (...,) of a gap (...,) m; in a sparse reward, a NaN gap gives -1."""
         if self.reward == "sparse":
             missed: FloatArray = np.subtract(gap < self.tolerance, 1.0)
             return missed
@@ -250,11 +250,11 @@ class Task(ABC):
     def penalty(self, state: State) -> FloatArray:
         """Return the singularity penalty before weighting, (n,) in [0, 1].
 
-        It is 1 past a singularity. Else it is 1 - (c / safe)^4 where the conditioning c is below
-        ``safe``, the machine's ``safe_conditioning``, and 0 elsewhere. It is steepest at ``safe``.
-        Policies ignored an earlier penalty, a cubic function of c with slope 0 at ``safe``. SAC
-        with joint increments, on goals next to the threshold ``safe``, spent 24% of the time below
-        it without a penalty, 19% with the cubic penalty, 1% with this penalty.
+        The penalty is 1 past a singularity. Elsewhere it is 1 - (c / safe)^4 if the conditioning c
+        is below the machine's ``safe_conditioning`` (safe), else 0. It is steepest at c = safe.
+        Policies ignored an earlier penalty, a cubic function of c with slope 0 at c = safe. With
+        SAC, joint increments as actions, and goals next to a singularity, c was below safe for 24%
+        of the time without a penalty, for 19% with the cubic penalty, and for 1% with this penalty.
         """
         values: FloatArray = loops().singularity_penalty(
             state.conditioning,
@@ -358,8 +358,7 @@ class Task(ABC):
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
         """Return the low and high corners (3,) m of the places where a block may start.
 
-        By default, these are all places that the robot can reach. A task with blocks that come from
-        elsewhere overrides this method.
+        The default is :meth:`reach_of`. A task with other starts overrides this method.
         """
         return self.reach_of(block)
 
@@ -422,7 +421,7 @@ class Task(ABC):
     # -- observation ------------------------------------------------------------------------------
 
     def robot_entries(self) -> tuple[Entry, ...]:
-        """Return the entries of the robot, from encoders and forward kinematics."""
+        """Return the robot's entries of the observation, from encoders and forward kinematics."""
         centre, extent, speed, step = self._scales()
         measure = self._measure
         return (
@@ -434,7 +433,7 @@ class Task(ABC):
         )  # fmt: skip
 
     def object_entries(self, index: int = 0, turn: bool = False) -> tuple[Entry, ...]:
-        """Return the entries of one object, from a camera and the vacuum gauge.
+        """Return one object's entries of the observation, from a camera and the vacuum gauge.
 
         Args:
             index: Number of the object in the scene.
@@ -451,7 +450,7 @@ class Task(ABC):
             (
                 "held",
                 "-",
-                f"vacuum by a gauge, 0 to 1; 0 if the {name} is not held",
+                f"vacuum, measured by a gauge, 0 to 1; 0 if the {name} is not held",
                 (0.5,),
                 (0.5,),
             ),
@@ -479,7 +478,7 @@ class Task(ABC):
         return values
 
     def _scales(self) -> tuple[Values, Values, Values, Values]:
-        """Return the region's centre and half size, m, world; limits of speed, m/s, and step, m."""
+        """Return the region's centre and half size, m, world; speed limits, m/s; step limits, m."""
         region, mount = self.machine.region, self.machine.mount
         step = np.multiply(self.machine.step_limit, self.control_period / CONTROL_PERIOD)
         low, high = np.array(region.low), np.array(region.high)
@@ -556,7 +555,8 @@ class Task(ABC):
         return low, high
 
     def lost(self, state: State) -> BoolArray:
-        """Return whether an object is off the table, or out of reach and beyond all goals, (n,)."""
+        """Return whether an object left the table, or the box of its allowed places, (n,)."""
+        # The box is around the robot's reach, all starts and all goals.
         places = np.ascontiguousarray(state.object_position)
         lost: BoolArray = loops().any_outside(places, *self._within)
         return lost
@@ -570,7 +570,7 @@ def _turn(index: int, state: State) -> FloatArray:
 
 
 def _columns(entries: Sequence[Entry]) -> Any:
-    """Return the index of the entries' columns in the array that their common source returns."""
+    """Return the NumPy index of the entries' columns in the result of the ``source`` they share."""
     if entries[0].columns is None:
         return slice(None)
     chosen = [k for entry in entries for k in range(*entry.columns or (0,))]

@@ -53,7 +53,7 @@ class Throw(Task):
     machine's region along x, as far as the table and the speed of the machine allow. The block is
     slippery: at a speed v it slides by v^2 / (2 mu g), with mu = 0.1 against the table. The goal is
     achieved if the block's centre is within 20 mm of it. With ``goals="tempting"``, the lowest
-    conditioning from the run-up to the stop of P is just above the safe threshold.
+    conditioning while P accelerates for the throw and brakes is just above the safe threshold.
     """
 
     block = Block(friction=0.1)
@@ -77,7 +77,7 @@ class Throw(Task):
         return starts
 
     def _draw_goal(self, rng: np.random.Generator) -> FloatArray:
-        """Draw a goal (3,) m for which P stays safe from the run-up to the stop."""
+        """Draw a goal (3,) m for which P is safe while it accelerates for the throw and brakes."""
         boxes, table = self.goals_of(self.block), self.on_table(self.block)
         ends = np.stack([self.machine.mount.to_world(end) for end in (table.low, table.high)])
 
@@ -121,7 +121,7 @@ class Throw(Task):
         """Return the place (..., 3) m of the release, and the run-up's last step along x (...,) m.
 
         When the block hits the table after a fall by h, friction (coefficient mu) reduces its speed
-        v by mu sqrt(2 g h). Fall and slide together cover v^2 / (2 mu g) + mu h along x.
+        v by mu sqrt(2 g h). The fall and the slide together cover v^2 / (2 mu g) + mu h along x.
         """
         low, high = self.reach_of(self.block)
         side = np.where(goal[..., 0] > (low[0] + high[0]) / 2, 1.0, -1.0)

@@ -32,10 +32,10 @@ def timed(
     With the path parameter s in [0, 1], b = (ds/dt)^2 and b' = db/ds, the torque is
     A b'/2 + B b + g, where A, B and the gravity torque g follow from the closed-form dynamics. The
     heat is the integral over time of the squared torques of all motors. Time and heat are convex in
-    b, and so is their sum, which Newton's method minimises. Without g, the shape of the optimal b
-    does not depend on the weights of time and heat in the sum. So the optimum is computed once,
-    without g. Its times are then multiplied by the smallest factor with which no motor exceeds a
-    limit, with g included.
+    b, and so is their sum, which Newton's method minimises. If g were 0, the shape of the optimal b
+    would not depend on the weights of time and heat in the sum. So the optimum is computed once,
+    for g = 0. The times of this optimum are then multiplied by the smallest factor with which no
+    motor exceeds a limit. The torques in this last step include g.
 
     Args:
         machine: Machine. The torques include its payload.
@@ -143,7 +143,7 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Find the smallest factor for the times with which every motor keeps its limits.
+    """Find the smallest factor for which no motor exceeds its limits.
 
     All times are multiplied by this factor. The search is a bisection.
     """

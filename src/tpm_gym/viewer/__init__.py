@@ -24,7 +24,7 @@ class ViewConfig:
     """Machine that is shown first: paper, wide, delta, or another registered machine."""
 
     host: str = "127.0.0.1"
-    """Address to listen on. Other computers reach the page only with another address."""
+    """Address to listen on. With the default, only this computer can open the page."""
 
     port: int = 8080
     """Port to listen on; if it is taken, the next free one."""

@@ -116,7 +116,7 @@ class Explore:
             self.gizmo.visible = not hidden
 
     def go_home(self) -> None:
-        """Move to the machine's home, in its own modes."""
+        """Move to the machine's home, in the machine's own modes."""
         self.set(self._kind.home())
 
     def set(self, posture: Posture) -> None:
@@ -150,7 +150,10 @@ class Explore:
 
     @property
     def text(self) -> str:
-        """Message in the panel that says why a posture does not exist, as HTML; empty for none."""
+        """Message in the panel, as HTML, that says why the requested posture does not exist.
+
+        The message is empty if the posture exists.
+        """
         return str(self._refusal.content)
 
     def _attempt(self, solve: Callable[[], Posture]) -> None:

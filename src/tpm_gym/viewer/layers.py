@@ -50,7 +50,7 @@ class Layers:
 
     Args:
         scene: Scene of a viser server.
-        kind: Kind of the machine, which computes the layers.
+        kind: The machine with its modes; this object computes what the layers show.
     """
 
     def __init__(self, scene: SceneApi, kind: Kind) -> None:
@@ -60,7 +60,11 @@ class Layers:
         self._keys: dict[str, Any] = {}
 
     def around(self, posture: Posture) -> Mapping[str, Found]:
-        """Return the available layers of a posture by name: the regions, and the kind's layers."""
+        """Return the available layers of a posture, by name.
+
+        These are the layer "region", with the boxes of the commands and of the goals, and the
+        layers that :meth:`Kind.layers` returns.
+        """
         machine = self._kind.machine
         regions = {"region": machine.region, "goals": machine.goal_region}
         return {"region": ("always", lambda: regions), **self._kind.layers(posture)}
@@ -165,7 +169,7 @@ LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
         "Constraint", "Constraint singularity of the working mode, purple", Layers._singular
     ),
     "aspects": (
-        "Aspects", "Regions of the working mode without singularities, on the side of P",
+        "Aspects", "Singularity-free regions of the working mode, on the side of P",
         Layers._aspects,
     ),
     "workspace": (
@@ -175,7 +179,7 @@ LAYERS: Final[Mapping[str, tuple[str, str, _Draw]]] = {
         "Task region", "Box of the commands (black) and of the goals (green)", Layers._region
     ),
     "conditioning": (
-        "Conditioning", "1/cond(J) in the plane of P parallel to xz, in these modes",
+        "Conditioning", "1/cond(J) in the plane of P parallel to xz, in the modes shown",
         Layers._conditioning,
     ),
     "margin": ("Margin", "Way from P to the nearest singularity", Layers._margin),

@@ -59,9 +59,15 @@ def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
 
 
 def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> FloatArray:
-    """Cut m flat grids of points (m, a, b, 3) at the boundary of a region.
+    """Cut k flat grids of points at the boundary of a region.
 
-    Grid points next to the region move to its boundary. Points farther outside become NaN.
+    A point outside the region moves to the boundary if a neighbour in the grid is inside. The other
+    points outside become NaN.
+
+    Args:
+        points: (k, u, v, 3) m; each grid has u x v points.
+        inside: Function of points (..., 3) m that returns an array (...,): whether each point is in
+            the region.
     """
     there = inside(points)
     found = np.where(there[..., None], points, np.nan)
@@ -79,10 +85,11 @@ def clipped(points: FloatArray, inside: Callable[[FloatArray], BoolArray]) -> Fl
 
 
 def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
-    """Return the points P (m, a, b, 3) of the surface on which a factor is zero.
+    """Return k grids of u x v positions of P, (k, u, v, 3) m, at which a factor is zero.
 
-    The factor depends on point C1 alone, and is zero on curves of C1. For each C1 on these curves,
-    link 7 turns P through a half circle. Points of other working modes are NaN.
+    The factor is zero only if point C1 is on one of k curves. On each curve, C1 has u positions.
+    For each position of C1, link 7 can turn P along a half circle, on which P has v positions.
+    Positions of P in other working modes are NaN.
     """
     x, z, p, q = (part[..., None] for part in sheets.curves(factor, mode, g))
     beta = np.linspace(-np.pi / 2, np.pi / 2, _AROUND)
@@ -93,7 +100,11 @@ def _swept(factor: str, mode: WorkingMode, g: Geometry) -> FloatArray:
 
 
 def _planes(factor: str, g: Geometry) -> FloatArray:
-    """Return points (m, a, b, 3) where sin(beta) = 0 (plane y = 0) or cos(beta) = 0 (|y| = l7)."""
+    """Return grids of u x v points, (k, u, v, 3) m, on the k planes on which a factor is zero.
+
+    For the factor "sin_beta", this is the plane y = 0. For "cos_beta", these are the two planes
+    |y| = l7.
+    """
     reach = g.l3 + g.l4
     x = np.linspace(-g.l1 - reach - g.l7, g.l1 + reach + g.l7, 241)
     z = np.linspace(-reach, reach + 2 * g.l6, 181)
@@ -103,7 +114,10 @@ def _planes(factor: str, g: Geometry) -> FloatArray:
 
 
 def _torus(g: Geometry) -> FloatArray:
-    """Return points (2, a, b, 3) on which leg 3 is stretched or folded: parts of a torus."""
+    """Return two grids of u x v positions of P, (2, u, v, 3) m, on a torus.
+
+    In the first grid, leg 3 is stretched. In the second grid, leg 3 is folded.
+    """
     turn = np.linspace(0, 2 * np.pi, 257)[:, None]
     tilt = np.arcsin(min(1.0, g.l7 / g.l4)) * np.linspace(-1, 1, _AROUND)
     parts = []
@@ -123,7 +137,11 @@ SURFACES: Final = {
 
 
 def grid_mesh(points: FloatArray) -> Mesh:
-    """Join neighbouring points of grids (m, a, b, 3) to triangles; leave out NaN points."""
+    """Join neighbouring points of k grids to triangles, and leave out NaN points.
+
+    Args:
+        points: (k, u, v, 3) m; each grid has u x v points.
+    """
     real = ~np.isnan(points[..., 0])
     index = np.arange(real.size).reshape(real.shape)
     corners = index[:, :-1, :-1], index[:, 1:, :-1], index[:, 1:, 1:], index[:, :-1, 1:]

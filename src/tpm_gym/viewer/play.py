@@ -17,13 +17,13 @@ from tpm_gym.viewer.player import Player, installed_engines, policies_for
 from tpm_gym.viewer.worker import Worker
 
 _PADDED: Any = {"min": {"pad": 0.1}, "max": {"pad": 0.1}}
-"""Range of an axis: the range of the curves, and a tenth more at each end."""
+"""Range of a plot's vertical axis: the range of the plotted values, plus a tenth at each end."""
 _COLOURS: Final = ("#0969da", "#d63031", "#2ea043", "#db8400", "#823cbe", "#118ab2")
 _MOTORS: Final = ("motor 1", "motor 2", "motor 3")
 _REDRAW: Final = 0.1
 """Shortest time between two drawings of the plots, s."""
 _SPEEDS: Final = (0.1, 4.0)
-"""Lowest and highest speed of an episode, in units of real time."""
+"""Lowest and highest speed at which an episode is played; 1 is real time."""
 _PAUSE: Final = 15
 """Control periods for which the end of an episode stays in view."""
 
@@ -228,7 +228,7 @@ class Play:
 
     @property
     def plots(self) -> list[GuiUplotHandle]:
-        """Visible plots: of the reward terms, and of the torques."""
+        """Visible plots: one plot of the reward terms, and one plot of the torques."""
         return [plot for plots in self._plots for plot in plots.values() if plot.visible]
 
     @property

@@ -28,7 +28,7 @@ _GOAL: Final = (30, 160, 70)
 
 
 def colour(rgba: Sequence[float]) -> tuple[int, int, int]:
-    """Convert a colour with parts from 0 to 1 to whole numbers from 0 to 255."""
+    """Convert red, green and blue of a colour, in [0, 1], to whole numbers in [0, 255]."""
     red, green, blue = (round(255 * part) for part in rgba[:3])
     return red, green, blue
 

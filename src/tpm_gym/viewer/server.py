@@ -49,7 +49,7 @@ def _free_port(host: str, port: int) -> int:
 
 
 def _bound(host: str, port: int) -> int | None:
-    """Return ``port``, or a free one instead of 0; None if the port is taken."""
+    """Return ``port``, or any free port if ``port`` is 0; None if the port is taken."""
     try:
         family = socket.getaddrinfo(host, port)[0][0]
         with socket.create_server((host, port), family=family) as found:

@@ -1,4 +1,4 @@
-"""The Delta as a machine, with the lengths of ABB's IRB 360 or others."""
+"""The Delta as a machine, with the lengths of ABB's IRB 360 or with other lengths."""
 
 from __future__ import annotations
 

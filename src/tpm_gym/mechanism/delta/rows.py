@@ -1,7 +1,8 @@
 """Compiled loops over many Deltas (:mod:`tpm_gym.mechanism.loops`).
 
-A row of ``built`` (b, 21) holds l1 to l5 (m) and the constants of the dynamics. ``machine`` (7,)
-holds the sign of the assembly mode, the signs of the working mode (3), and gravity.
+The loops have two arguments that depend on the mechanism. ``built`` has a row of 21 numbers for
+each machine: l1 to l5 (m), and the 16 constants of the dynamics. ``machine`` has seven numbers: the
+sign of the assembly mode, three signs of the working mode, and three components of gravity (m/s^2).
 """
 
 from tpm_gym.arrays import FloatArray

@@ -13,7 +13,7 @@ rods 4 have a universal joint at the arm instead. Rods 11 turn on the paper's re
 R_g and R_h are ball joints here, since revolutes would add redundant constraints. So end link 10, a
 straight bar through these two ball joints, can roll about its own axis.
 
-When all joints are at zero, all frames are parallel to the paper frame, and arms and rods point
+When all joints are at zero, all frames are parallel to the machine's frame, and arms and rods point
 along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 """
 

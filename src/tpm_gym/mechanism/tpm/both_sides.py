@@ -55,7 +55,7 @@ class BothSides(TPM):
         return super().conditioning_at(self._own_side(position))
 
     def mirrored(self) -> BothSides:
-        """Return the machine with its home and its assembly mode on the other side."""
+        """Return the machine with home, goals and assembly mode on the other side of y = 0."""
         (a, b, c), low, high = self.home, self.goal_region.low, self.goal_region.high
         goals = Region((low[0], -high[1], low[2]), (high[0], -low[1], high[2]))
         mode = replace(self.assembly_mode, sin_beta=-self.assembly_mode.sin_beta)

@@ -11,17 +11,18 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
 
 * the arms turn about the motors' axes;
 * a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points. Rods 4 and 11
-  also turn about their own axes as they swing. The inertia of a swing includes this turning, and
-  the bodies that swing with the rods. End link 9 swings with rods 11. The crosses (the middle
-  pieces of the universal joints at arm 2) swing with rods 4;
+  also turn about their own axes as they swing. Some bodies swing with rods: end link 9 with rods
+  11, and the crosses (the middle pieces of the universal joints at arm 2) with rods 4. The turning
+  of the rods and these bodies have constants of their own, see ``Swing`` in
+  :mod:`tpm_gym.mechanism.inertia`;
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z. It is a bar between C1 and P, except for constant offsets;
 * platform, cup, payload and end link 10 translate as P does. The cup's slide is assumed to be at
   rest. End link 10 can also roll about its own axis. This roll does not change the motors' torques
   and is left out.
 
-Units are SI. In the paper frame, gravity points along +z, as the base hangs upside down. Functions
-with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
+Units are SI. In the machine's frame, gravity points along +z, as the base hangs upside down.
+Functions with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
 """
 
 from __future__ import annotations

@@ -112,7 +112,7 @@ class TPM(CompiledMachine):
 PAPER_TPM = TPM(
     name="paper",
     geometry=PAPER,
-    # The cup touches the table at z = 0.93 m of the paper frame, well inside the reach.
+    # The cup touches the table at z = 0.93 m of the machine's frame, well inside the reach.
     mount=Mount(height=0.97),
     # The slab 0 < y < l7, less a margin to the parallel singularity y = 0 and to the edge y = l7.
     # Nearer to y = 0, when a random policy reverses x or z at full speed, the motors' torque cannot
@@ -123,9 +123,9 @@ PAPER_TPM = TPM(
     home=(-0.04, 0.028, 0.80),
     step_limit=(0.030, 0.005, 0.030),
     joint_limit=0.08,
-    # At 0.08, a joint error of 1 mrad moves the platform by 3 mm at most. Towards y = 0, that
-    # motion grows without bound and the conditioning falls with y. In a sixth of the region, the
-    # conditioning is below 0.08.
+    # At a conditioning of 0.08, a joint error of 1 mrad moves the platform by 3 mm at most. As y
+    # goes to 0, the conditioning goes to 0 and this motion of the platform grows without bound. In
+    # a sixth of the region, the conditioning is below 0.08.
     safe_conditioning=0.08,
 )
 """Machine with the lengths of the paper's case study, upside down over a table."""
@@ -135,7 +135,8 @@ WIDE_TPM = TPM(
     geometry=WIDE,
     mount=Mount(height=0.95),
     # The largest box of WIDE whose conditioning is at least 0.1 (analysis.aspects), less a margin.
-    # It is extended towards y = 0, to points whose conditioning is so low that the penalty acts.
+    # It is extended towards y = 0, to points whose conditioning is below ``safe_conditioning``, so
+    # that rewards have a singularity penalty there.
     region=Region(low=(0.12, 0.10, 0.58), high=(0.48, 0.50, 0.883)),
     goal_region=Region(low=(0.14, 0.12, 0.62), high=(0.46, 0.48, 0.88)),
     home=(0.30, 0.36, 0.75),

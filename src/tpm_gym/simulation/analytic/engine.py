@@ -39,12 +39,12 @@ from tpm_gym.simulation.state import Scene
 _CHECK_ABOVE = 0.5
 """Fraction of a motor's largest torque above which the torques of all time steps are computed."""
 _NEAR_PLANE = 1.2
-"""Distance of P from the plane of symmetry normal to ``mirror_axis``, divided by the machine's
-``step_limit`` (m) along this axis.
+"""Largest distance from the plane of symmetry at which P is near the plane.
 
-Beyond this distance, torques are computed from differences of joint positions. At this distance
-and at full speed, P's acceleration normal to the plane, if computed from these differences, has an
-error of 0.2 m/s^2.
+The plane is normal to ``mirror_axis``. The distance is given as a multiple of the machine's
+``step_limit`` (m) along this axis. If P is farther from the plane, torques are computed from
+differences of joint positions. At this distance and at full speed, the differences give P's
+acceleration normal to the plane with an error of 0.2 m/s^2.
 """
 _COURSE = tuple(f"_{name}" for name in Course._fields)
 _COLUMNS = (*_COURSE, "_behind")
@@ -63,8 +63,8 @@ class AnalyticEngine:
         drive: Servo drives of the motors; None for ideal drives.
 
     Attributes:
-        least_steps: Smallest number of time steps in a control period, because accelerations are
-            computed from the positions at the ends of the last three time steps.
+        least_steps: Smallest allowed number of time steps in a control period: 3. Accelerations
+            are computed from the positions at the ends of the last three time steps.
         torques: (K, n, 3) N m, torques in all time steps of the last control period; None unless
             ``physics.torques`` is ``"every"``.
 
@@ -200,7 +200,7 @@ class AnalyticEngine:
 
         The plane is normal to ``mirror_axis``. Near the plane, torques cannot be computed from
         differences of the joint positions. The result is True for all robots if any robot has had
-        encoder bias or length errors.
+        encoder bias or length errors since :meth:`load`.
         """
         if not self._exact:
             return np.ones(self._count, dtype=np.bool_)
@@ -257,9 +257,11 @@ class AnalyticEngine:
         Args:
             start: (n, 3) rad, joint positions at the beginning of the control period.
             rates: (n, 3) rad/s, joint velocities at the beginning of the control period.
-            theta: (n, k, 3) rad, joint positions at the ends of the last k time steps.
+            theta: (n, k, 3) rad, joint positions at the ends of the last k of the K time steps of
+                the control period.
             path: Path of the control period.
-            push: (n, K, 3) N, force of objects on P; (n, 1, 3) zeros without objects.
+            push: (n, K, 3) N, force of cup and objects on P in each of the K time steps of the
+                control period. If the scene has no objects, this is an array (n, 1, 3) of zeros.
         """
         if self.physics.torques == "none":
             self._torque = np.full_like(self._torque, np.nan)
@@ -282,12 +284,13 @@ class AnalyticEngine:
         return over
 
     def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
-        """Compute the torques of some robots in the last m time steps, (r, m, 3) N m.
+        """Compute the torques of some robots in the last k time steps, (r, k, 3) N m.
 
         Args:
             rows: (r,) indices of the robots.
             theta: (r, m + 2, 3) rad, joint positions at the ends of the last m + 2 time steps.
-            push: (r, K, 3) N, force of objects on P in each of K time steps; the last m are used.
+            push: (r, K, 3) N, force of cup and objects on P in each of K time steps; the forces in
+                the last m time steps are used.
         """
         joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]

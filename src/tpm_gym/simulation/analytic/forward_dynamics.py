@@ -92,9 +92,12 @@ class ServoSteps:
 
 
 Touch = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Function of three positions of P, each (r, 3) m: one time step before the beginning, at the
-beginning, and at the end of a time step. The function returns the force (r, 3) N of objects on P
-and the mass (r,) kg of the held objects."""
+"""Function that moves objects and cups by one time step.
+
+The arguments are three positions of P, each (r, 3) m: at the beginning of the previous time step,
+at the beginning of this time step, and at the end of this time step. The function returns the force
+(r, 3) N of objects on P and the mass (r,) kg of the held objects.
+"""
 
 
 def march(

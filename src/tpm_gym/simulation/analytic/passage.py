@@ -55,10 +55,11 @@ class _Dynamics(NamedTuple):
 
 
 class _Lifted(NamedTuple):
-    """Kinematics at points that are, like the machine's home, on one side of the singular plane.
+    """Kinematics at points on the same side of the singular plane as the machine's home.
 
     Attributes:
-        points: Points mirrored to this side, at least _LIFT away from the plane, (r, 3) m.
+        points: Points on this side, at least _LIFT away from the plane, (r, 3) m. Points that
+            were on the other side have been mirrored.
         side: Factors that mirror a vector in the same way as its point, (r, 3): -1 for the
             component normal to the plane if the point was mirrored, else 1.
         theta: Joint positions at ``points``, (r, 3) rad.
@@ -135,9 +136,10 @@ def _dynamics(
 
 
 def _lifted(machine: Machine, built: FloatArray | None, position: FloatArray) -> _Lifted:
-    """Mirror points (r, 3) beyond the plane, and move points to a distance of at least _LIFT.
+    """Compute the kinematics at points on the home's side of the singular plane.
 
-    All points are then on that side of the plane on which the machine's home is.
+    Points of ``position`` (r, 3) m on the other side are mirrored to the side of the machine's
+    home. Points that are nearer to the plane than _LIFT are moved to this distance.
     """
     axis = machine.mirror_axis or 0
     home = np.sign(machine.home[axis])

@@ -61,7 +61,8 @@ def ideal_step(
         at: Kinematics and dynamics at the beginning of the time step.
         step: Time step, s.
         new: Output.
-        behind: (2, r) whether a motor was at its limit in the last and in this time step; output.
+        behind: (2, r) whether a motor was at its limit: in the previous time step (first row), and
+            in this time step (second row); updated.
     """
     rate = 1.0 / step
     for row in range(len(effort)):
@@ -93,7 +94,7 @@ def ideal_push(
     torque: FloatArray,
     behind: BoolArray,
 ) -> None:
-    """Find the torques of ideal drives from the inverse inertia, which may be singular.
+    """Find the torques of ideal drives from the inverse inertia; this matrix may be singular.
 
     Other arguments are explained in :func:`ideal_step`.
 
@@ -212,8 +213,8 @@ def modes_left(
 ) -> tuple[NDArray[np.int8], bool]:
     """Return the mode that each robot has left (r,), and whether any robot has left one.
 
-    When P passes a parallel singularity, the joints reverse. So forward kinematics still return a
-    position, but in the wrong assembly mode. Only ``side`` detects this.
+    After P has passed a parallel singularity, the joint positions also fit a point on the side that
+    P has left. Forward kinematics return this point. So only ``side`` detects the passage.
 
     Args:
         position: (r, 3) m, P by forward kinematics; NaN if there is no assembly.
@@ -266,7 +267,7 @@ def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
 def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> Vector:
     """Solve mass @ u = impulse - limit * signs for u, where ``signs`` are the assumed signs of u.
 
-    If an entry of ``signs`` is 0, this entry of u is 0, and its equation is left out.
+    If a component of ``signs`` is 0, this component of u is 0, and its equation is left out.
     """
     (a, b, c, d, e, f), (p, q, r) = mass, (abs(signs[0]), abs(signs[1]), abs(signs[2]))
     own = a * p + 1 - p, b * p * q, c * p * r, d * q + 1 - q, e * q * r, f * r + 1 - r
@@ -279,7 +280,7 @@ def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> V
 def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
     """Find x from -``most`` to ``most`` that minimises x @ matrix @ x / 2 - wanted @ x.
 
-    At the minimum, some entries are at a bound, and the cost is stationary in the others.
+    At the minimum, some components of x are at a bound, and the cost is stationary in the others.
     """
     found, best = _ZERO, np.inf
     for choice in range(27):  # all combinations of no bound, upper bound and lower bound

@@ -21,9 +21,10 @@ _FASTEST = 2.5  # m/s, largest speed of lip towards object: twice the largest co
 
 
 class Grip(NamedTuple):
-    """Held object, vacuum, and the held object's pose in the tool's inertial frame.
+    """Held object, vacuum, and the held object's pose.
 
-    The pose is None if no object is held.
+    The pose is given in the frame at the centre of mass of the link with the cup. It is None if no
+    object is held.
     """
 
     hold: Hold = EMPTY
@@ -112,7 +113,8 @@ class Cup:
     def _load(self) -> Load:
         """Return the force of the weld in the last time step.
 
-        PyBullet reports the force along the world's axes, and the cup's axis is vertical.
+        PyBullet reports the force along the world's axes. The cup's axis is vertical. So the
+        tension is the negative z component, and the x and y components are the shear.
         """
         x, y, z, *_ = self._client.getConstraintState(self._weld)
         return Load(-z, math.hypot(x, y))
@@ -136,7 +138,10 @@ class Cup:
         return -1
 
     def _seat(self, index: int) -> Pose:
-        """Return the pose of an object in the tool's inertial frame, 20 um below the cup."""
+        """Return the pose that an object shall have while the cup holds it, 20 um below the lip.
+
+        The pose is given in the frame at the centre of mass of the link with the cup.
+        """
         client, (body, link) = self._client, self._robot.tool
         state = client.getLinkState(body, link, computeForwardKinematics=True)
         inverse = client.invertTransform(state[0], state[1])

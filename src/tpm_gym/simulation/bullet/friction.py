@@ -1,12 +1,14 @@
 """Coulomb's friction cone for Bullet's direct solver, which has a friction box.
 
 **Level faces.** The solver limits the friction force of a contact to mu * N (coefficient times
-normal force) along each of two directions. At 45 degrees to these directions, friction is sqrt(2)
-times too strong, and it does not oppose the slip. On a level face the directions are the world's x
-and y, and Bullet can scale both limits for each body. For a slipping contact, this module scales
-both limits so that a corner of the box lies on the cone, opposite to the slip. For a sticking
-contact, the limit along x follows from the cone and the last force along y, and vice versa. Without
-a last force, the box lies inside the cone.
+normal force) along each of two directions. If an object slips at 45 degrees to these directions,
+friction is sqrt(2) times too strong. At other oblique angles, friction is also not opposite to the
+slip. On a level face the directions are the world's x and y, and Bullet can scale both limits for
+each body. For a slipping contact, this module scales both limits so that a corner of the box lies
+on the cone, opposite to the slip. For a sticking contact, the module computes the limit along x
+from the cone and the friction along y in the last time step, and the limit along y from the
+friction along x. If this friction was zero or very small, its next direction is unknown. Then the
+module chooses a box inside the cone.
 
 **Slides.** All points of a contact share these scales, and contacts between objects have no scales.
 So this module adds the friction that was missing in the last time step, as a force and a torque.
@@ -50,15 +52,15 @@ _UNKNOWN = (math.sqrt(0.5), math.sqrt(0.5))  # scales for an unknown direction o
 _BOX = (1.0, 1.0)  # Bullet's default scales
 _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the solver
 _Push = tuple[Vector, float]
-"""Record of the friction force that was added to a contact in a time step: two entries, N.
+"""Record of the friction force that was added to a contact in a time step: a vector and a limit, N.
 
-The first entry is the steady part of the added force (see ``compiled.friction_force``). The second
-entry is the largest size of the added force that the contact forces allow.
+The vector is the steady part of the added force (see ``compiled.friction_force``). The limit is the
+largest magnitude of the added force: mu * N minus the solver's friction.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
 _Slip = tuple[float, float, float, float]
-"""Slip of a contact point (x, y, z), and its speed, m/s."""
+"""Slip velocity (x, y, z) of a contact point, and its magnitude, m/s."""
 _Wrench = tuple[float, float, float, float, float, float]
 """Force (x, y, z) N, and torque (x, y, z) N m about an object's centre."""
 _Lacks = dict[tuple[int, int], _Wrench]
@@ -79,7 +81,8 @@ class _Face:
 class _Motion(NamedTuple):
     """Place (m), velocity (m/s) and angular velocity (rad/s) of a link of a body.
 
-    Forces move the body only if it is free.
+    ``free`` tells whether forces can move the link: True for objects and the cup, False for tables
+    and belts.
     """
 
     body: int
@@ -142,7 +145,7 @@ class Friction:
         self._scale = partial(pybullet.changeDynamics, physicsClientId=number)
 
     def reset(self) -> None:
-        """Set the scales of all faces to those for an unknown direction of the force."""
+        """Set the friction scales of each face to the values for a force of unknown direction."""
         self._pushes, self._lacks = {}, {}
         for face in (self._cup, *self._belts, *(face for _, face, _ in self._bodies)):
             face.scales = _BOX  # differs from _UNKNOWN, so that _set() sends the scales to Bullet
@@ -199,7 +202,7 @@ class Friction:
                 self._scale_at(index, points, index == held)
 
     def _scale_at(self, index: int, points: Sequence[Any], held: bool) -> None:
-        """Scale the friction of an object at its contact points, and add what was missing."""
+        """Scale an object's friction at its contacts, and add friction that the solver left out."""
         (body, table, block), cup = self._bodies[index], self._cup
         rough, motion = self._factor * block.friction, self._motion(body)
         if below := [point for point in points if point[2] == table.body]:
@@ -241,9 +244,9 @@ class Friction:
     ) -> None:
         """Scale the friction of a face, and add the friction that the last time step left out.
 
-        The friction that is missing in one time step may not be missing in the next: a blow lasts
-        one time step, and a slip may reverse. So the smaller one of the values of the last two time
-        steps is added.
+        Friction that is missing in one time step is not always missing in the next: an impact lasts
+        one time step, and a slip can reverse. So the missing friction of the last two time steps is
+        compared, and the smaller value is added.
 
         Args:
             motion: Motion of the object.
@@ -286,7 +289,7 @@ class Friction:
         """Apply the friction that the solver leaves out where an object's side is pushed.
 
         All contact points at upright faces are treated as one contact, at the point with the
-        largest force. A blow lasts only one time step. So the friction is limited to the smaller
+        largest force. An impact lasts only one time step. So the friction is limited to the smaller
         one of the limits of the last two time steps.
 
         Args:

@@ -40,7 +40,7 @@ _urdf_text = lru_cache(maxsize=16)(urdf.urdf_text)
 
 
 class Robot:
-    """Robot with one multibody per leg and closed loops.
+    """Robot that consists of one multibody for each leg; constraints close its loops.
 
     Attributes:
         bodies: Body ids of the legs.

@@ -20,8 +20,8 @@ from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
 _SOFTER = 0.5
 """Factor of the stiffness of a held object's contacts, for example with the table.
 
-With factor 1, the table would push a held object upwards against the cup's spring. The spring's
-force, and with it the motors' torques, would be 3% smaller than in PyBullet.
+With factor 1, MuJoCo would push a held object out of the table too fast. Then the force of the
+cup's spring and the torques of the motors would be 3% smaller than in PyBullet.
 """
 
 
@@ -111,7 +111,11 @@ class Cup:
         return -1
 
     def _sealed_pose(self, index: int) -> Pose:
-        """Return the pose of an object in the tool's frame, at least 20 um below the cup."""
+        """Return the pose of an object in the tool's frame, for the weld to the cup.
+
+        If the gap between lip and object is less than 20 um, the pose is moved down until the gap
+        is 20 um.
+        """
         origin, turn = self._robot.tool()
         position, quaternion = self._scenery.pose(index)
         lip, _ = self._robot.cup()

@@ -45,13 +45,15 @@ class _Saved:
 class MujocoEngine:
     """Engine that simulates one robot with MuJoCo.
 
-    Each call ends with the first half of the next time step (positions, contacts, constraints), so
-    that all values that can be read belong to the same instant.
+    ``place``, ``advance`` and ``restore`` end with the first half of the next time step, which
+    computes positions, contacts and constraints. So all values that can be read belong to the same
+    instant.
 
     Args:
         gui: Whether to open MuJoCo's viewer.
-        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``. If None, the renderer that the environment
-            variable ``MUJOCO_GL`` names; if it names none of the three, the first that works.
+        renderer: ``"egl"``, ``"osmesa"`` or ``"glfw"``. If None, the environment variable
+            ``MUJOCO_GL`` names the renderer. If the variable has none of these three names, the
+            first renderer that works is used.
         physics: A :class:`Physics` or a mapping of its attributes.
         drive: Servo drives of the motors; None for ideal drives.
 

@@ -82,7 +82,7 @@ def segmentation_ids(model: mujoco.MjModel, tool: str, scene: Scene) -> NDArray[
 
 
 def object_name(index: int) -> str:
-    """Return the common name of an object's body, joint and geom."""
+    """Return the name that an object's body, joint and geom share."""
     return f"object {index}"
 
 
@@ -92,7 +92,7 @@ def grip_name(index: int) -> str:
 
 
 def _light(root: Element, world: Element) -> None:
-    """Add lights without shadows, a white sky, and the limits of the depth, as in PyBullet."""
+    """Add a white sky, lights that cast no shadows, and the limits of the depth, as in PyBullet."""
     add(root, "statistic", extent=1)  # then the numbers of "map" are metres
     visual = add(root, "visual")
     add(visual, "map", znear=NEAR, zfar=FAR)
@@ -122,7 +122,7 @@ def _surroundings(world: Element, machine: Machine, scene: Scene) -> None:
 
 
 def _geom(parent: Element, kind: str, size: Vector, colour: Colour, **values: str | Vector) -> None:
-    """Add a geom that collides only in the listed pairs."""
+    """Add a geom. It can collide only with the geoms that :func:`_contacts` pairs with it."""
     add(parent, "geom", type=kind, size=size, rgba=colour, contype=0, conaffinity=0, **values)
 
 
@@ -135,7 +135,11 @@ def _object(world: Element, index: int, block: Block) -> None:
 
 
 def _contacts(root: Element, scene: Scene, physics: Physics) -> Element:
-    """Return the pairs that can collide: objects with everything, and the cup with the table."""
+    """Return the pairs of geoms that can collide.
+
+    An object can collide with table, belt, floor, cup and other objects. The cup can also collide
+    with table and belt.
+    """
     lips = [geom.attrib["name"] for geom in root.iter("geom") if geom.get("class") == SOLID]
     objects = [(object_name(index), block.friction) for index, block in enumerate(scene.objects)]
     tops = [("table", TABLE.friction)]

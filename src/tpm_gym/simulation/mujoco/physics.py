@@ -16,8 +16,8 @@ class Physics(Numerics):
     Attributes:
         time_step: Time step, s; the control period must be an integer multiple of it.
         iterations: Largest number of iterations of the solver (Newton's method) per time step.
-        tolerance: The solver stops when an iteration improves its cost by less than this value, in
-            MuJoCo's unit.
+        tolerance: MuJoCo's option ``tolerance``. The solver stops when an iteration lowers the
+            solver's scaled cost function by less than this value.
 
     Raises:
         ConfigurationError: If a value is out of range.

@@ -31,11 +31,12 @@ class Pictures:
     """Renderer of the scene. It opens an OpenGL context for the first picture of each size.
 
     Args:
-        renderer: One of :data:`RENDERERS`. If None, the renderer that the environment variable
-            ``MUJOCO_GL`` names; if it names none of these, the first that works.
+        renderer: One of :data:`RENDERERS`. If None, the environment variable ``MUJOCO_GL`` names
+            the renderer. If the variable has none of these names, the first renderer that works is
+            used.
 
     Raises:
-        ConfigurationError: If ``renderer`` is another name.
+        ConfigurationError: If ``renderer`` is neither None nor one of :data:`RENDERERS`.
     """
 
     def __init__(self, renderer: str | None) -> None:

@@ -27,8 +27,9 @@ class Margin:
     Attributes:
         distance: Distance from P, m.
         point: The singular position (3,) m, machine's frame.
-        factor: One of :data:`tpm_gym.analysis.singularity.FACTORS`: the name of the factor of a
-            Jacobian's determinant, or of the elevation, that is zero at ``point``.
+        factor: Name of the factor that is zero at ``point``, one of
+            :data:`tpm_gym.analysis.singularity.FACTORS`. A position is singular where a factor is
+            zero.
     """
 
     distance: float
@@ -88,9 +89,10 @@ class Posture:
 
 
 class Kind:
-    """Machine with its modes, postures and layers; this class shows any machine in its own modes.
+    """Machine with its modes, postures and layers, as the viewer shows them.
 
-    A mechanism with more modes, or with layers, has a derived class.
+    This class is for any machine, but shows only the machine's own working mode and assembly mode,
+    and no layers. A mechanism with more modes, or with layers, has a derived class.
 
     Attributes:
         machine: The machine.
@@ -122,11 +124,13 @@ class Kind:
             position: Point P, machine's frame.
             operation: Operation mode.
             working: Working mode.
-            tilt: Preferred tilt, rad. Of several rotated postures, the nearest in tilt is returned.
+            tilt: Preferred tilt, rad. If several rotated postures exist, the posture whose tilt is
+                nearest to this value is returned.
 
         Raises:
-            InputError: If position is not three finite numbers, or no rotated posture exists there.
-            UnreachableError: If a leg does not reach.
+            InputError: If ``position`` is not three finite numbers, or ``operation`` is "rotated"
+                and no rotated posture exists at ``position``.
+            UnreachableError: If ``operation`` is "translating" and ``position`` is out of reach.
         """
         del operation, working, tilt
         theta = self.machine.require_inverse(np.array(vector("position", position)))
@@ -136,8 +140,10 @@ class Kind:
         """Solve the posture with the motors at ``theta`` (3,) rad, in an assembly mode.
 
         Raises:
-            InputError: If theta is not three finite numbers, or the rotated mode does not exist.
-            UnreachableError: If the assembly mode does not exist there.
+            InputError: If ``theta`` is not three finite numbers, or ``assembly`` belongs to the
+                rotated operation mode and has no posture at ``theta``.
+            UnreachableError: If ``assembly`` belongs to the translating operation mode and has no
+                posture at ``theta``.
         """
         angles = vector("theta", theta)
         found = self.machine.require_evaluate(np.array(angles))
@@ -148,7 +154,7 @@ class Kind:
         )
 
     def home(self) -> Posture:
-        """Return the machine's home, in its own modes."""
+        """Return the posture with P at home, in the machine's own modes."""
         working = getattr(self.machine, "working_mode", None)
         return self.at_point(self.machine.home, next(iter(self.assembly)), working)
 

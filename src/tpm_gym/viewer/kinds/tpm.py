@@ -34,7 +34,11 @@ def _label(mode: kinematics.AssemblyMode | kinematics.RotatedMode) -> str:
 
 
 class TPMKind(Kind):
-    """Kind of a TPM. Its modes are WorkingModes, and AssemblyModes or RotatedModes."""
+    """Kind of a TPM.
+
+    Its working modes are WorkingModes. Its assembly modes are AssemblyModes in translating
+    operation, and RotatedModes in rotated operation.
+    """
 
     lists: Mapping[str, str] = {
         "Operation": "Link 3' only translates, or is turned about y",
@@ -54,7 +58,8 @@ class TPMKind(Kind):
     def __init__(self, machine: TPM) -> None:
         """Store the machine, and label its working modes.
 
-        The label of an elbow is "out" if it is bent as in the machine's working mode, else "in".
+        An elbow that is bent as in the machine's own working mode has the label "out". Other
+        elbows have the label "in".
         """
         super().__init__(machine)
         self.working = {

@@ -29,7 +29,16 @@ from tpm_gym.simulation.state import Belt, Block
 
 
 class Reading(NamedTuple):
-    """State of objects and cups on n tables; as in :class:`tpm_gym.simulation.engine.Readout`."""
+    """State of the k objects and the cup on each of n tables, in the world frame.
+
+    Attributes:
+        position: (n, k, 3) m, centres of the objects.
+        quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
+        velocity: (n, k, 3) m/s, velocities of the objects.
+        angular_velocity: (n, k, 3) rad/s, angular velocities of the objects.
+        held: (n,) index of the object in the cup; -1 for none.
+        vacuum: (n,) Pa below the ambient pressure.
+    """
 
     position: FloatArray
     quaternion: FloatArray
@@ -74,18 +83,24 @@ class Contact:
         self.place(everything, middle)
 
     def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
-        """Scale nominal masses and friction coefficients on tables ``rows`` by factors (r,)."""
+        """Set the objects' masses and friction coefficients on some tables.
+
+        Args:
+            rows: Indices of the r tables.
+            mass_factor: (r,) factors of the nominal masses.
+            friction_factor: (r,) factors of the nominal friction coefficients.
+        """
         for name, factor in (("mass", mass_factor), ("friction", friction_factor)):
             nominal = np.array([getattr(block, name) for block in self._blocks])
             self._tables.objects[name][rows] = factor[:, None] * nominal
 
     def set_belt(self, rows: Any, speed: FloatArray) -> None:
-        """Set the speeds (r,) m/s of the belts of some tables, along x."""
+        """Set the speeds (r,) m/s, along x, of the belts on the tables with indices ``rows``."""
         for tables in (self._tables, self._earlier):
             tables.belts[rows] = speed
 
     def place(self, rows: IntArray, poses: FloatArray) -> None:
-        """Release held objects, set vacuum to zero, and place all objects without motion.
+        """Release held objects, set the vacuum to zero, and place all objects with zero velocity.
 
         If all objects of a table stand upright on the table top, and its belt does not run, they
         count as at rest immediately.
@@ -99,7 +114,7 @@ class Contact:
     def advance(
         self, rows: IntArray, route: Route, vacuum_on: BoolArray, last: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Simulate the time steps of ``route`` on some tables.
+        """Simulate the time steps of ``route`` for the objects and cups on some tables.
 
         Args:
             rows: (r,) indices of the tables.
@@ -120,7 +135,7 @@ class Contact:
         return force, carried
 
     def read(self) -> Reading:
-        """Return copies of the state of all tables."""
+        """Return the state of the objects and cups on all tables, as copies."""
         count, number = self._tables.objects.shape
         position, velocity, spin = np.empty((3, count, number, 3))
         reading = Reading(
@@ -131,17 +146,17 @@ class Contact:
         return reading
 
     def undo(self, rows: IntArray) -> None:
-        """Undo the last :meth:`advance` of some tables."""
+        """Undo the last :meth:`advance` on the tables with the indices ``rows`` (r,)."""
         rows = rows[self._earlier.awake[rows]]  # the others have not changed
         for own, earlier in zip(self._tables, self._earlier, strict=True):
             own[rows] = earlier[rows]
 
     def save(self) -> FloatArray:
-        """Return the state of all tables as an array (n, c)."""
+        """Return the state of all tables as an array (n, c): c numbers for each table."""
         return np.concatenate(self._plain(), axis=1)
 
     def restore(self, saved: FloatArray) -> None:
-        """Restore the state of all objects and contacts from the result of :meth:`save`."""
+        """Restore the state of objects, cups and contacts from the result of :meth:`save`."""
         first = 0
         for plain in self._plain():
             plain[:] = saved[:, first : first + plain.shape[1]]

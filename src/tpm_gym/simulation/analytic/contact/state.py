@@ -109,7 +109,8 @@ class Tables(NamedTuple):
         objects: (n, k) records of :data:`OBJECT`.
         cups: (n,) records of :data:`CUP_STATE`.
         forces: (n, slots(k), 3) N, contact forces of the last time step.
-        awake: (n,) whether objects or cup may still change when the lip is far from all objects.
+        awake: (n,) whether objects or cup may change while the lip is far from all objects. If
+            False, time steps are skipped until the lip may touch an object.
         belts: (n,) m/s, speeds of the belts along x.
     """
 
@@ -128,8 +129,9 @@ class Route(NamedTuple):
     Attributes:
         before: (r, 3), P one time step before the beginning.
         now: (r, 3), P at the beginning.
-        controls: (r, c, 3), control points, whose convex hull contains the motion.
-        weights: (K, c), weights of the control points after each time step.
+        controls: (r, c, 3), c control points for each robot. Their convex hull contains the motion.
+        weights: (K, c), weights for each time step. P at the end of a time step is the sum of the
+            control points, each multiplied by its weight.
     """
 
     before: FloatArray

@@ -55,16 +55,18 @@ def advance(
     push: FloatArray,
     carried: FloatArray,
 ) -> None:
-    """Simulate the time steps of ``path`` on the tables ``rows``.
-
-    ``rows``, ``path`` and ``on`` are the arguments ``rows``, ``route`` and ``vacuum_on`` of
-    :meth:`.contact.Contact.advance`.
+    """Simulate objects and cups of some robots, each over its own table, in a control period.
 
     Args:
-        tables: State of all tables; changed.
-        earlier: Output: state of the simulated tables at the beginning of the control period.
-        push: (r, m, 3) N, force on the platform in the last m time steps of ``path``, machine's
-            frame; output, initially zero.
+        tables: State of the objects and cups of all robots; changed.
+        earlier: Output: the state of the simulated robots at the beginning of the control period.
+        rows: (r,) indices of the robots to simulate.
+        path: Motion of point P of these robots, in all time steps of the control period.
+        on: (r,) whether the vacuum is on.
+        setting: Constants of the simulation.
+        work: Workspace of the solver.
+        push: (r, w, 3) N, force on the platform in each of the final w time steps of ``path``,
+            machine's frame; output, initially zero.
         carried: (r,) kg, masses of the held objects at the end; output, initially zero.
     """
     steps, skipped, turn = len(path.weights), len(path.weights) - push.shape[1], setting.turn
@@ -116,7 +118,9 @@ def read(
 
 @kept
 def place(tables: Tables, rows: IntArray, poses: FloatArray, setting: Setting) -> None:
-    """Place all objects without motion, as explained in :class:`.contact.Contact`.
+    """Release held objects, and place all objects with zero velocity.
+
+    The details are explained in :meth:`.contact.Contact.place`.
 
     Args:
         poses: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects, world.
