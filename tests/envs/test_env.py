@@ -122,6 +122,7 @@ def test_a_spec_with_physics_and_randomisation_survives_json():
     snapshot = inner.save_state()
     again.reset()
     other.restore_state(snapshot)
+    assert inner.np_random_seed == other.np_random_seed == 1
     assert play(again.unwrapped, actions) == play(env.unwrapped, actions)
 
 
@@ -276,8 +277,12 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env):
         {"task": "reach"},
         {"machine": "wide"},
         {"control": "joints"},
+        {"engine": "analytic"},
+        {"drive": "servo"},
         {"randomisation": {"latency": 1}},
         {"physics": PHYSICS},
+        {"shield": True},
+        {"observations": "pixels"},
     ]
     for options in others:
         other = TPMEnv(**{"task": "pick_and_place", **options})

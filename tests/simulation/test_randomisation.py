@@ -217,7 +217,9 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth():
     env, quiet = TPMEnv("reach", randomisation={"encoder_noise": size}), TPMEnv("reach")
     env.reset(seed=0)
     quiet.reset(seed=0)
-    action, before = np.array([0.1, 0.05, -0.1]), None
+    action, before = np.array([0.1, 0.05, -0.1]), env.state.theta - quiet.state.theta
+    assert before.all()
+    assert not env.state.theta_dot.any()  # the encoders were read once
     for step in range(400):
         turned = action * np.sign(np.sin(step / 7))
         observation = env.step(turned)[0]
@@ -231,9 +233,8 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth():
         position = MOUNT.to_world(kinematics.forward(state.theta))
         np.testing.assert_allclose(state.fk_position, position, atol=1e-12)
         np.testing.assert_allclose(observation["achieved_goal"], position, atol=1e-7)
-        if before is not None:
-            rates = true.theta_dot + (error - before) / 0.04
-            np.testing.assert_allclose(state.theta_dot, rates, atol=1e-9)
+        rates = true.theta_dot + (error - before) / 0.04
+        np.testing.assert_allclose(state.theta_dot, rates, atol=1e-9)
         before = error
     gains = np.linalg.norm(PAPER_TPM.evaluate(tuple(true.theta)).jacobian, axis=1)
     errors = np.array(seen)
