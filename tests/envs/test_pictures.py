@@ -219,6 +219,9 @@ def test_a_tile_is_one_picture_of_the_first_environments(engine):
     envs.close()
     with pytest.raises(EpisodeError, match="closed"):
         envs.render_tile()
+    for mode in (None, "rgbd_tuple"):
+        with pytest.raises(ConfigurationError, match=f"render_mode = {mode!r}"):
+            TPMVectorEnv(engine=engine, render_mode=mode).render_tile()
 
 
 # -- options ---------------------------------------------------------------------------------------

@@ -3,7 +3,9 @@
 import copy
 import os
 import pickle
+import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -22,6 +24,7 @@ from tpm_gym.errors import (
     ResetOptionError,
     UnreachableError,
 )
+from tpm_gym.kinematics import ELBOWS_OUT, inverse
 
 PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJointsDense-v0", "TPMReach-v0"
 LATE = "TPMConveyorDense-v0"  # its camera is late
@@ -120,7 +123,7 @@ def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode):
 
 @pytest.mark.parametrize(("mode", "drive"), [*zip(MODES, ["ideal", "servo", "ideal"], strict=True)])
 def test_threads_change_no_bit(mode, drive):
-    options = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7}
+    options = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7, "stagger": True}
     runs = []
     for threads in (1, 3):
         envs = make(PICK, 5, autoreset_mode=mode, num_threads=threads, **options)
@@ -142,9 +145,27 @@ def test_threads_change_no_bit(mode, drive):
 def test_the_first_episodes_are_of_different_lengths_where_that_is_asked_for():
     envs = make(REACH, 10, stagger=True, max_episode_steps=20)
     envs.reset(seed=0)
-    ended = [envs.step(actions)[3].sum() for actions in actions_of(envs, 20)]
-    assert max(ended) <= 2
-    assert sum(ended) == 10
+    ended = np.array([envs.step(actions)[3] for actions in actions_of(envs, 10)])
+    envs.reset(options={"reset_mask": np.arange(10) == 0})  # the others go on
+    ended = np.append(ended, [envs.step(actions)[3] for actions in actions_of(envs, 10)], axis=0)
+    assert ended.sum(axis=1).max() <= 2
+    assert ended.sum(axis=0).tolist() == [0] + 9 * [1]
+
+
+@pytest.mark.parametrize("mode", ["assembly", "working"])
+def test_past_a_singularity_an_episode_is_truncated_and_the_others_go_on(mode):
+    envs: Any = gym.make_vec(REACH, num_envs=3)
+    envs.reset(seed=0)
+    simulation, (x, y, z) = envs._parts[1].core.simulation, envs.machine.home
+    if mode == "working":
+        folded = replace(ELBOWS_OUT, cos_beta=-ELBOWS_OUT.cos_beta)
+        simulation.reset(np.array([0]), inverse((x, y, z), folded))
+    for step in range(1, 5) if mode == "assembly" else ():
+        simulation.move(np.array([(x, y - 0.01 * step, z)]), np.zeros(1, dtype=np.bool_))
+    *_, ended, infos = envs.step(np.zeros((3, 3)))
+    assert ended.tolist() == infos[f"{mode}_mode_changed"].tolist() == [False, True, False]
+    assert not envs.step(np.zeros((3, 3)))[3].any()
+    envs.close()
 
 
 @pytest.mark.parametrize("randomisation", [None, EVERYTHING], ids=["nominal", "everything"])
@@ -173,6 +194,7 @@ def test_what_is_saved_goes_on_equally(randomisation):
 
 
 def test_copies_step_in_threads_of_their_own():
+    before = threading.enumerate()
     envs = make(PICK, 6, num_threads=2)
     envs.reset(seed=0)
     course = actions_of(envs, 5)
@@ -184,6 +206,7 @@ def test_copies_step_in_threads_of_their_own():
         for actions, wanted in zip(course, expected, strict=True):
             assert_same(each.step(actions)[0], wanted[0])
         each.close()
+    assert set(threading.enumerate()) <= set(before)
 
 
 def test_refused_snapshots_change_nothing():

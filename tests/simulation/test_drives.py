@@ -173,8 +173,8 @@ def test_motion_is_that_of_springs_and_dampers_integrated_by_eulers_backward_met
 @pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7])
 def test_it_is_stable_at_any_stiffness_and_mass(stiffness, masses):
     simulation = simulation_of(Servo(stiffness, 60.0))
-    plant = Plant(link_masses=(masses,) * (len(PAPER_TPM.mechanism.links) - 1))
-    simulation.reset(THETA, plant=plant)
+    links = len(PAPER_TPM.mechanism.links) - 1
+    simulation.reset(THETA, plant=Plant(link_masses=(*[masses] * (links - 1), max(masses, 1.0))))
     for share in (0.2, 0.4, 0.6, 0.8, *[1.0] * 25):
         command = (HOME[0] + 0.05 * share, HOME[1] + 0.01 * share, HOME[2] + 0.05 * share)
         state = simulation.move(command)
@@ -241,18 +241,19 @@ def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -
     ]
 
 
+@pytest.mark.parametrize("strength", [0.5, 1.0])
 @pytest.mark.parametrize(("drive", "beyond"), [(None, True), (Servo(), False)])
-def test_a_slow_motor_keeps_to_its_line(drive, beyond, monkeypatch):
+def test_a_slow_motor_keeps_to_its_line(drive, beyond, strength, monkeypatch):
     # At 1 rad/s the corner, at 2 no torque is left; actions go up to 3 rad/s.
     slow = replace(TORQUE_MOTOR, no_load_speed=2.0, motor_constant=10.0)
     monkeypatch.setattr(parts, "TORQUE_MOTOR", slow)
     machine = replace(PAPER_TPM, name="slow")
     simulation = simulation_of(drive, machine)
-    simulation.reset(THETA)
+    simulation.reset(THETA, plant=Plant(motor_strength=(strength,) * 3))
     seen = watched(simulation)
     for shift in (0.03, 0.06, 0.09, 0.12, 0.12, 0.12):  # m, upwards, well away from y = 0
         simulation.move((HOME[0], HOME[1] + 0.01, HOME[2] - shift))
-    over = over_the_line(seen, slow, 1.0)
+    over = over_the_line(seen, slow, strength)
     assert (max(over) > 1.0) == beyond
     assert beyond or max(over) < 1e-9
 
