@@ -27,7 +27,7 @@ from episodes import (
 from paths import SUPPORT
 
 from tpm_gym import TPMEnv
-from tpm_gym.errors import ConfigurationError, EpisodeError, ModeChangeError
+from tpm_gym.errors import ConfigurationError, EpisodeError
 from tpm_gym.tasks.expert import Expert
 
 
@@ -179,20 +179,6 @@ def test_a_copy_of_a_closed_environment_is_closed():
         pybullet = pytest.importorskip("pybullet")
         with pytest.raises(pybullet.error):  # and holds no client
             other.simulation.engine.read()
-
-
-def test_a_copy_of_a_truncated_environment_has_to_be_reset_too():
-    env = TPMEnv("reach")
-    env.reset(seed=0)
-    for y in (0.018, 0.008, -0.002, -0.012):
-        env.simulation.move(np.array([(-0.04, y, 0.80)]), np.zeros(1, dtype=bool))
-    env._core.report()
-    other = copy.deepcopy(env)
-    assert other.state.assembly_mode_changed
-    for one in (env, other):
-        with pytest.raises(ModeChangeError):
-            one.step(np.zeros(3))
-        one.close()
 
 
 def test_an_environment_with_a_window_refuses_to_be_copied():

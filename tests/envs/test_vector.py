@@ -62,7 +62,6 @@ def assert_same(one: Any, other: Any) -> None:
     [
         (REACH, {"randomisation": {"latency": 3}, "machine": "wide"}),
         (JOINTS, {"drive": "servo", "randomisation": {**EVERYTHING, **OF_SERVOS}}),
-        (PICK, {"randomisation": {"link_mass": 2.0, "motor_strength": 0.5}}),
         ("TPMPickAndPlaceJoints-v0", {"randomisation": EVERYTHING, "goals": "tempting"}),
     ],
     ids=str,
@@ -180,10 +179,8 @@ def test_what_is_saved_goes_on_equally(randomisation):
             each.step(actions)
     moment = envs.save_state()
     expected = [unsaved.step(actions) for actions in course[30:]]
-    for name, count, machine in (("machine", 7, "wide"), ("number of environments", 6, "paper")):
-        another = make(PICK, count, machine=machine, randomisation=randomisation)
-        with pytest.raises(InputError, match=f"same task and options, got 'another {name}'"):
-            another.restore_state(moment)
+    with pytest.raises(InputError, match="got 'another number of environments"):
+        make(PICK, 6, randomisation=randomisation).restore_state(moment)
     for again in (envs, other, envs):
         again.restore_state(moment)
         again.reset()  # changes nothing in the snapshot
@@ -297,10 +294,6 @@ def test_options_are_refused_by_name():
         ({"max_episode_steps": 0}, "1 or more"),
         ({"stagger": "no"}, "True or False"),
         ({"autoreset_mode": "Never"}, "'NextStep', 'SameStep', 'Disabled'"),
-        ({"physics": {"time_step": 0.02}}, "time_step"),
-        ({"physics": {"time_step": 1e-12}}, "at least 1e-06 s"),
-        ({"physics": {"torques": "all"}}, "'every'"),
-        ({"machine": "round"}, "'paper', 'wide'"),
         ({"num_envs": 10**12}, "num_envs"),
         ({"render_mode": "human"}, "render_mode"),
         ({"num_threads": 2, "observations": "pixels"}, "num_threads"),

@@ -20,7 +20,7 @@ from tpm_gym.mechanism import PAPER_TPM, Machine, parts
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Plant, Scene, Servo
 from tpm_gym.simulation.compiled import limited
-from tpm_gym.simulation.drives import References, drive_of
+from tpm_gym.simulation.drives import References, ServoDrives, drive_of
 from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
@@ -183,6 +183,19 @@ def test_it_is_stable_at_any_stiffness_and_mass(stiffness, masses):
     np.testing.assert_allclose(state.theta, PAPER_TPM.inverse(command), atol=10 / stiffness)
 
 
+def test_the_law_uses_each_robots_own_lengths_and_home_where_no_assembly_exists():
+    drives, plant = ServoDrives(Servo(), PAPER_TPM, 3, 0.004), Plant(length_errors=(1e-3,) * 7)
+    theta = np.array([THETA, np.add(THETA, 3.0), THETA])
+    drives.alter(np.array([2]), [plant])
+    drives.begin(theta)
+    drives.rest(np.array([2]), theta[2:])
+    (home, nowhere, longer), dynamics = drives.law[2], plant.of(PAPER_TPM).dynamics
+    np.testing.assert_allclose(home, PAPER_TPM.dynamics.mass_matrix(THETA))
+    np.testing.assert_array_equal(nowhere, home)
+    np.testing.assert_allclose(longer, dynamics.mass_matrix(THETA))
+    np.testing.assert_allclose(drives.memory[0, 2], dynamics.gravity(THETA))
+
+
 def test_springs_and_dampers_give_nothing_that_was_not_put_in():
     servo, dynamics = Servo(feedforward="none"), PAPER_TPM.dynamics
     simulation = simulation_of(servo)
@@ -256,6 +269,12 @@ def test_a_slow_motor_keeps_to_its_line(drive, beyond, strength, monkeypatch):
     over = over_the_line(seen, slow, strength)
     assert (max(over) > 1.0) == beyond
     assert beyond or max(over) < 1e-9
+
+
+def test_motors_whose_torque_falls_from_below_zero_speed_are_refused(monkeypatch):
+    monkeypatch.setattr(parts, "TORQUE_MOTOR", replace(TORQUE_MOTOR, motor_constant=1.0))
+    with pytest.raises(ConfigurationError, match="corner speed is below their speed"):
+        simulation_of(Servo(), replace(PAPER_TPM, name="weak"))
 
 
 # -- friction, stiffness ---------------------------------------------------------------------------

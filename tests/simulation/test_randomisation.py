@@ -273,6 +273,10 @@ def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(simulat
     assert not state.passed_singularity
     state = simulation.move(HOME)
     np.testing.assert_allclose(state.fk_position, state.platform_position, atol=1e-5)
+    simulation.reset(PAPER_TPM.inverse(np.add(HOME, (0.1, 0.0, 0.0))))
+    state = simulation.reset(THETA, noise=impossible)  # before the first reading: where it was put
+    assert np.array_equal(state.fk_position, good.fk_position)
+    assert state.conditioning == good.conditioning
 
 
 # -- latency ---------------------------------------------------------------------------------------
