@@ -2,7 +2,6 @@
 
 import inspect
 import re
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +14,7 @@ from tpm_gym import TPMEnv
 from tpm_gym.envs.rendering import RENDER_MODES
 from tpm_gym.errors import ConfigurationError, InputError
 from tpm_gym.mechanism.machine import Machine
-from tpm_gym.mechanism.tpm import PAPER_TPM, WIDE_TPM
+from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation import Plant
 from tpm_gym.simulation.settings import Numerics
 from tpm_gym.simulation.state import State
@@ -54,21 +53,6 @@ def test_bad_options_are_refused_by_name(options):
     name = next(iter(options))
     assert caught.value.name == name
     assert repr(options[name])[:20] in repr(caught.value.value)
-
-
-def test_unknown_options_raise_a_type_error():
-    with pytest.raises(TypeError, match="colour"):
-        gym.make("TPMReach-v0", colour="red")
-
-
-@pytest.mark.parametrize("machine", ["wide", WIDE_TPM, replace(PAPER_TPM, name="mine")], ids=str)
-def test_machines_are_taken_by_name_or_value(machine):
-    env = gym.make("TPMReach-v0", machine=machine, engine="pybullet")
-    inner = env.unwrapped
-    assert inner.machine == (WIDE_TPM if machine == "wide" else machine)
-    env.reset(seed=0)
-    home = inner.machine.mount.to_world(inner.machine.home)
-    np.testing.assert_allclose(inner.state.platform_position, home, atol=1e-4)
 
 
 def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(monkeypatch):

@@ -244,9 +244,9 @@ def test_torque_falls_from_the_corner_to_the_no_load_speed_and_brakes_in_full(sp
         assert limited(sign * 0.01, sign * speed, *line) == min(0.01, share * effort) * sign
 
 
-def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -> list[float]:
+def over_the_line(seen: list[tuple[Any, Vector]], motor: Any) -> list[float]:
     """By how much torque each motor was beyond its line in each time step, N m."""
-    line = strength * motor.peak_torque, motor.corner_speed, motor.no_load_speed
+    line = motor.peak_torque, motor.corner_speed, motor.no_load_speed
     return [
         abs(torque - limited(torque, rate, *line))
         for motors, rates in seen
@@ -254,19 +254,18 @@ def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -
     ]
 
 
-@pytest.mark.parametrize("strength", [0.5, 1.0])
 @pytest.mark.parametrize(("drive", "beyond"), [(None, True), (Servo(), False)])
-def test_a_slow_motor_keeps_to_its_line(drive, beyond, strength, monkeypatch):
+def test_a_slow_motor_keeps_to_its_line(drive, beyond, monkeypatch):
     # At 1 rad/s the corner, at 2 no torque is left; actions go up to 3 rad/s.
     slow = replace(TORQUE_MOTOR, no_load_speed=2.0, motor_constant=10.0)
     monkeypatch.setattr(parts, "TORQUE_MOTOR", slow)
     machine = replace(PAPER_TPM, name="slow")
     simulation = simulation_of(drive, machine)
-    simulation.reset(THETA, plant=Plant(motor_strength=(strength,) * 3))
+    simulation.reset(THETA)
     seen = watched(simulation)
     for shift in (0.03, 0.06, 0.09, 0.12, 0.12, 0.12):  # m, upwards, well away from y = 0
         simulation.move((HOME[0], HOME[1] + 0.01, HOME[2] - shift))
-    over = over_the_line(seen, slow, strength)
+    over = over_the_line(seen, slow)
     assert (max(over) > 1.0) == beyond
     assert beyond or max(over) < 1e-9
 

@@ -161,6 +161,15 @@ def test_draws_fill_the_stated_ranges_and_are_independent():
     assert np.abs(correlations).max() < 0.1
 
 
+def test_equal_seeds_draw_equal_values_with_and_without_the_attributes_of_servos():
+    some = Randomisation(**{name: _RANGES[name] for name in _RANGES.keys() - OF_SERVOS.keys()})
+    plants = [
+        drawn.draw(np.random.default_rng(2), PAPER_TPM)
+        for drawn in (some, replace(some, **OF_SERVOS))
+    ]
+    assert plants[0] == replace(plants[1], servo_stiffness=(1.0,) * 3, joint_friction=(0.0,) * 3)
+
+
 def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit():
     prints = set()
     for option in (None, {"link_mass": (1.0, 1.0), "encoder_noise": 0}, Randomisation()):
