@@ -106,7 +106,8 @@ def test_segmentation_tells_bodies_apart(engine):
     ids = drawn(engine, mode="segmentation")
     assert (ids.shape, ids.dtype) == ((480, 640), np.int32)
     assert set(np.unique(ids)) == {BACKGROUND, TABLETOP, ROBOT, CUP, OBJECTS}
-    depth, image = drawn(engine, mode="depth_array"), drawn(engine)
+    (_, depth), image = drawn(engine, mode="rgbd_tuple"), drawn(engine)
+    assert np.array_equal(depth, drawn(engine, mode="depth_array"))
     assert np.isfinite(depth[ids != BACKGROUND]).all()  # up to the edges
     block = ids == OBJECTS
     assert (is_red(image) & block).sum() > 0.9 * block.sum()
