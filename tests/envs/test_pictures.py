@@ -1,6 +1,7 @@
 """Pictures in every engine: cameras, goal markers, depth, segmentation, and many environments."""
 
 import contextlib
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -105,7 +106,8 @@ def test_segmentation_tells_bodies_apart(engine):
     ids = drawn(engine, mode="segmentation")
     assert (ids.shape, ids.dtype) == ((480, 640), np.int32)
     assert set(np.unique(ids)) == {BACKGROUND, TABLETOP, ROBOT, CUP, OBJECTS}
-    depth, image = drawn(engine, mode="depth_array"), drawn(engine)
+    (_, depth), image = drawn(engine, mode="rgbd_tuple"), drawn(engine)
+    assert np.array_equal(depth, drawn(engine, mode="depth_array"))
     assert np.isfinite(depth[ids != BACKGROUND]).all()  # up to the edges
     block = ids == OBJECTS
     assert (is_red(image) & block).sum() > 0.9 * block.sum()
@@ -152,6 +154,28 @@ def test_pictures_change_nothing(engine):
     assert ends[0] == ends[1]
 
 
+def test_a_window_shows_each_step_in_real_time_and_makes_up_for_no_delay(monkeypatch):
+    clock, shown = [100.0], list[float]()
+
+    def later(seconds):
+        clock[0] += seconds
+
+    def show():
+        later(0.01)  # drawing takes a while
+        shown.append(clock[0])
+
+    time = SimpleNamespace(perf_counter=lambda: clock[0], sleep=later)
+    monkeypatch.setattr("tpm_gym.envs.single.time", time)
+    env = TPMEnv(engine="analytic")
+    monkeypatch.setattr(env, "render_mode", "human")
+    monkeypatch.setattr(env._core, "show", show)
+    env.reset(seed=0)
+    for step in range(6):
+        later(1.0 if step == 3 else 0.01)
+        env.step(np.zeros(3))
+    np.testing.assert_allclose(np.diff(shown), [0.02, 0.04, 0.04, 1.03, 0.02, 0.04], atol=1e-9)
+
+
 # -- many environments -----------------------------------------------------------------------------
 
 
@@ -196,6 +220,9 @@ def test_a_tile_is_one_picture_of_the_first_environments(engine):
     envs.close()
     with pytest.raises(EpisodeError, match="closed"):
         envs.render_tile()
+    for mode in (None, "rgbd_tuple"):
+        with pytest.raises(ConfigurationError, match=f"render_mode = {mode!r}"):
+            TPMVectorEnv(engine=engine, render_mode=mode).render_tile()
 
 
 # -- options ---------------------------------------------------------------------------------------

@@ -17,8 +17,8 @@ ROBOT = 9  # position, velocity, command
 OPTIONS: dict[str, Any] = {"observations": "pixels", "pixel_size": 36}
 
 
-@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPickAndPlaceJointsDense-v0"])
-def test_observations_have_a_picture_and_the_robot_but_not_the_block(engine, env_id):
+@pytest.mark.parametrize("env_id", ["TPMReach-v0", "TPMPushJointsDense-v0", "TPMStack-v0"])
+def test_observations_have_a_picture_and_the_robot_but_not_the_blocks(engine, env_id):
     env = gym.make(env_id, engine=engine, **OPTIONS)
     plain = gym.make(env_id, engine=engine)
     for seed in (0, 1):
@@ -62,16 +62,17 @@ def test_the_expert_needs_the_block_and_says_so():
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 def test_pixels_of_vector_environments_follow_autoreset(engine, mode):
     options = {"engine": engine, "autoreset_mode": mode, **OPTIONS}
-    envs = TPMVectorEnv("reach", num_envs=2, max_episode_steps=3, **options)
+    frames = {"render_mode": "rgb_array", "width": 36, "height": 36}
+    envs = TPMVectorEnv("reach", num_envs=2, max_episode_steps=3, stagger=True, **options, **frames)
     first, _ = envs.reset(seed=[0, 1])
     assert envs.observation_space.contains(first)
     for step in range(4):
         observation, _, _, ended, infos = envs.step(envs.action_space.sample())
-        assert observation["pixels"].shape == (2, 36, 36, 3)
-        if mode == "SameStep" and step == 2:
-            last = infos["final_obs"][0]["pixels"]
-            assert ended.all()
-            assert not np.array_equal(last, observation["pixels"][0])
+        assert np.array_equal(observation["pixels"], envs.render())
+        assert ended.tolist() == [step == 2, step == 1]
+        for row in np.flatnonzero(ended) if mode == "SameStep" else ():
+            last = infos["final_obs"][row]["pixels"]
+            assert not np.array_equal(last, observation["pixels"][row])
     envs.close()
 
 

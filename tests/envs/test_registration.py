@@ -45,7 +45,6 @@ def test_an_id_means_what_it_and_the_datasheet_say(env_id):
         env.spec.max_episode_steps,
     ]
     assert f"| {name} | {' | '.join(map(str, sizes))} |" in TPMEnv.__doc__
-    assert env.metadata["render_fps"] == (250 if name == "Cycle" else 25)
 
 
 @pytest.mark.usefixtures("registries")

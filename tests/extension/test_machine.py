@@ -49,7 +49,10 @@ def test_where_nothing_tempts_tempting_goals_are_refused(task):
         tpm_gym.TPMEnv(task, machine="gantry", goals="tempting")
 
 
-def test_its_lengths_cannot_be_off():
-    randomised = tpm_gym.TPMEnv(machine="gantry", randomisation={"length_error": 1e-3})
-    _, info = randomised.reset(seed=0)
-    assert info["randomisation"]["length_errors"] == ()
+def test_its_encoders_can_be_off_and_its_lengths_cannot():
+    options = {"length_error": 1e-3, "encoder_bias": 1e-3}
+    randomised = tpm_gym.TPMEnv(machine="gantry", randomisation=options)
+    for seed in range(2):  # its J is read-only
+        _, info = randomised.reset(seed=seed)
+        assert info["randomisation"]["length_errors"] == ()
+        assert any(info["randomisation"]["encoder_bias"])

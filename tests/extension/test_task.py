@@ -130,7 +130,10 @@ def an_entry(scale, source, columns=None):
         (an_entry((np.nan,) * 3, lambda state: state.torque), "'extra', scale = .*fin"),
         *(({"events": (name,)}, f"'{name}' .*methods") for name in ("absent", "tolerance")),
         ({"events": ("_hidden",)}, "'_hidden' .*begin with _"),
-        ({"events": ("final_obs",)}, "'final_obs' .*names other than"),
+        *(
+            ({"events": (name,)}, f"'{name}' .*names other than")
+            for name in ("randomisation", "final_obs", "final_info", "episode")
+        ),
         (event("conditioning", lambda state: state.held < 0), "'conditioning' .*names other than"),
         (
             event("fast", lambda state: np.linalg.norm(state.fk_velocity) > 0.1),

@@ -124,7 +124,7 @@ def test_a_belt_that_ran_in_the_last_episode_stands_still(engine: str) -> None:
     simulation = line.simulation
     theta = PAPER_TPM.require_inverse(simulation.commands)
     objects = {"block 0": np.array([place])}
-    simulation.reset(np.arange(1), theta, objects, belt_speed=np.zeros(1))
+    simulation.reset(np.arange(1), theta, objects)
     assert np.abs(line.run([(STILL, 10)]) - place).max() < 1e-3
 
 

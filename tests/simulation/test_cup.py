@@ -187,6 +187,19 @@ def test_who_pulls_too_hard_loses_the_block(engine, mass, kept):
     assert state.vacuum > 0.99 * CUP.vacuum if kept else state.vacuum < 1
 
 
+def test_it_is_sealed_in_the_time_step_in_which_it_touches_at_any_speed(monkeypatch):
+    pytest.importorskip("pybullet")
+    found = []
+    for fastest in (None, 1e3):  # m/s; so fast, the cup could be anywhere, and always looks
+        if fastest is not None:
+            monkeypatch.setattr("tpm_gym.simulation.bullet.cup._FASTEST", fastest)
+        simulation = start("pybullet", height=0.132)
+        states = [go(simulation, 0.132 - 0.03 * k, 1, vacuum=True) for k in (1, 2, 3, 4, 4)]
+        assert states[-1].held == 0
+        found.append([(state.vacuum, *state.object_position[0]) for state in states])
+    assert found[0] == found[1]
+
+
 @each_engine
 @pytest.mark.parametrize("steps", [1, 3, 5])
 def test_a_moment_of_any_pressure_is_gone_back_to_exactly(engine, steps):

@@ -20,7 +20,7 @@ from tpm_gym.mechanism import PAPER_TPM, Machine, parts
 from tpm_gym.mechanism.motor import TORQUE_MOTOR
 from tpm_gym.simulation import Plant, Scene, Servo
 from tpm_gym.simulation.compiled import limited
-from tpm_gym.simulation.drives import References, drive_of
+from tpm_gym.simulation.drives import References, ServoDrives, drive_of
 from tpm_gym.simulation.settings import count_steps
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
@@ -173,14 +173,27 @@ def test_motion_is_that_of_springs_and_dampers_integrated_by_eulers_backward_met
 @pytest.mark.parametrize("stiffness", [1e3, 1e5, 1e7])
 def test_it_is_stable_at_any_stiffness_and_mass(stiffness, masses):
     simulation = simulation_of(Servo(stiffness, 60.0))
-    plant = Plant(link_masses=(masses,) * (len(PAPER_TPM.mechanism.links) - 1))
-    simulation.reset(THETA, plant=plant)
+    links = len(PAPER_TPM.mechanism.links) - 1
+    simulation.reset(THETA, plant=Plant(link_masses=(*[masses] * (links - 1), max(masses, 1.0))))
     for share in (0.2, 0.4, 0.6, 0.8, *[1.0] * 25):
         command = (HOME[0] + 0.05 * share, HOME[1] + 0.01 * share, HOME[2] + 0.05 * share)
         state = simulation.move(command)
     np.testing.assert_allclose(state.theta_dot, 0, atol=2e-3)
     # What is fed forward is the nominal machine's, and off by its weight at most.
     np.testing.assert_allclose(state.theta, PAPER_TPM.inverse(command), atol=10 / stiffness)
+
+
+def test_the_law_uses_each_robots_own_lengths_and_home_where_no_assembly_exists():
+    drives, plant = ServoDrives(Servo(), PAPER_TPM, 3, 0.004), Plant(length_errors=(1e-3,) * 7)
+    theta = np.array([THETA, np.add(THETA, 3.0), THETA])
+    drives.alter(np.array([2]), [plant])
+    drives.begin(theta)
+    drives.rest(np.array([2]), theta[2:])
+    (home, nowhere, longer), dynamics = drives.law[2], plant.of(PAPER_TPM).dynamics
+    np.testing.assert_allclose(home, PAPER_TPM.dynamics.mass_matrix(THETA))
+    np.testing.assert_array_equal(nowhere, home)
+    np.testing.assert_allclose(longer, dynamics.mass_matrix(THETA))
+    np.testing.assert_allclose(drives.memory[0, 2], dynamics.gravity(THETA))
 
 
 def test_springs_and_dampers_give_nothing_that_was_not_put_in():
@@ -231,9 +244,9 @@ def test_torque_falls_from_the_corner_to_the_no_load_speed_and_brakes_in_full(sp
         assert limited(sign * 0.01, sign * speed, *line) == min(0.01, share * effort) * sign
 
 
-def over_the_line(seen: list[tuple[Any, Vector]], motor: Any, strength: float) -> list[float]:
+def over_the_line(seen: list[tuple[Any, Vector]], motor: Any) -> list[float]:
     """By how much torque each motor was beyond its line in each time step, N m."""
-    line = strength * motor.peak_torque, motor.corner_speed, motor.no_load_speed
+    line = motor.peak_torque, motor.corner_speed, motor.no_load_speed
     return [
         abs(torque - limited(torque, rate, *line))
         for motors, rates in seen
@@ -252,9 +265,15 @@ def test_a_slow_motor_keeps_to_its_line(drive, beyond, monkeypatch):
     seen = watched(simulation)
     for shift in (0.03, 0.06, 0.09, 0.12, 0.12, 0.12):  # m, upwards, well away from y = 0
         simulation.move((HOME[0], HOME[1] + 0.01, HOME[2] - shift))
-    over = over_the_line(seen, slow, 1.0)
+    over = over_the_line(seen, slow)
     assert (max(over) > 1.0) == beyond
     assert beyond or max(over) < 1e-9
+
+
+def test_motors_whose_torque_falls_from_below_zero_speed_are_refused(monkeypatch):
+    monkeypatch.setattr(parts, "TORQUE_MOTOR", replace(TORQUE_MOTOR, motor_constant=1.0))
+    with pytest.raises(ConfigurationError, match="corner speed is below their speed"):
+        simulation_of(Servo(), replace(PAPER_TPM, name="weak"))
 
 
 # -- friction, stiffness ---------------------------------------------------------------------------

@@ -161,6 +161,15 @@ def test_draws_fill_the_stated_ranges_and_are_independent():
     assert np.abs(correlations).max() < 0.1
 
 
+def test_equal_seeds_draw_equal_values_with_and_without_the_attributes_of_servos():
+    some = Randomisation(**{name: _RANGES[name] for name in _RANGES.keys() - OF_SERVOS.keys()})
+    plants = [
+        drawn.draw(np.random.default_rng(2), PAPER_TPM)
+        for drawn in (some, replace(some, **OF_SERVOS))
+    ]
+    assert plants[0] == replace(plants[1], servo_stiffness=(1.0,) * 3, joint_friction=(0.0,) * 3)
+
+
 def test_a_machine_without_deviations_is_the_nominal_one_to_the_last_bit():
     prints = set()
     for option in (None, {"link_mass": (1.0, 1.0), "encoder_noise": 0}, Randomisation()):
@@ -217,7 +226,9 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth():
     env, quiet = TPMEnv("reach", randomisation={"encoder_noise": size}), TPMEnv("reach")
     env.reset(seed=0)
     quiet.reset(seed=0)
-    action, before = np.array([0.1, 0.05, -0.1]), None
+    action, before = np.array([0.1, 0.05, -0.1]), env.state.theta - quiet.state.theta
+    assert before.all()
+    assert not env.state.theta_dot.any()  # the encoders were read once
     for step in range(400):
         turned = action * np.sign(np.sin(step / 7))
         observation = env.step(turned)[0]
@@ -231,9 +242,8 @@ def test_noise_is_in_what_the_encoders_say_and_not_in_the_truth():
         position = MOUNT.to_world(kinematics.forward(state.theta))
         np.testing.assert_allclose(state.fk_position, position, atol=1e-12)
         np.testing.assert_allclose(observation["achieved_goal"], position, atol=1e-7)
-        if before is not None:
-            rates = true.theta_dot + (error - before) / 0.04
-            np.testing.assert_allclose(state.theta_dot, rates, atol=1e-9)
+        rates = true.theta_dot + (error - before) / 0.04
+        np.testing.assert_allclose(state.theta_dot, rates, atol=1e-9)
         before = error
     gains = np.linalg.norm(PAPER_TPM.evaluate(tuple(true.theta)).jacobian, axis=1)
     errors = np.array(seen)
@@ -272,6 +282,10 @@ def test_angles_that_cannot_be_assembled_leave_the_last_reading_in_place(simulat
     assert not state.passed_singularity
     state = simulation.move(HOME)
     np.testing.assert_allclose(state.fk_position, state.platform_position, atol=1e-5)
+    simulation.reset(PAPER_TPM.inverse(np.add(HOME, (0.1, 0.0, 0.0))))
+    state = simulation.reset(THETA, noise=impossible)  # before the first reading: where it was put
+    assert np.array_equal(state.fk_position, good.fk_position)
+    assert state.conditioning == good.conditioning
 
 
 # -- latency ---------------------------------------------------------------------------------------

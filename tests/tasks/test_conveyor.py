@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from episodes import expert_episode
 
-from tpm_gym.errors import ResetOptionError, UnreachableError
-from tpm_gym.mechanism import PAPER_TPM
+from tpm_gym import TPMEnv
+from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
 from tpm_gym.tasks import Conveyor
 from tpm_gym.tasks.conveyor import SPEEDS
 
@@ -52,12 +53,24 @@ def test_tempting_ways_are_only_just_safe():
         assert 0.95 < least / PAPER_TPM.safe_conditioning < 1.4
 
 
-def test_the_camera_shows_the_block_as_many_steps_late_as_stated():
-    env = gym.make("TPMConveyor-v0", engine="analytic").unwrapped
+class Watched(Conveyor):
+    """Reports when the block has moved by 5 mm."""
+
+    events, origin = ("moved",), 0.0
+
+    def moved(self, state):
+        return state.object_position[:, 0, 0] > self.origin + 0.005
+
+    lost = moved
+
+
+def test_the_camera_alone_shows_the_block_late_and_as_many_steps_as_stated():
+    env = TPMEnv(Watched, reward="dense", engine="analytic")
     rng, delay = np.random.default_rng(0), Conveyor.camera_delay
     for seed in range(2):  # the second episode shows nothing of the first
         observation, _ = env.reset(seed=seed)
         true, shown = [env.state.object_position[0].copy()], []
+        env.task.origin = true[0][0]
         for step in range(12):
             seen = env.task.decode(observation["observation"])["object_position"]
             np.testing.assert_allclose(seen, observation["achieved_goal"], atol=1e-6)
@@ -66,8 +79,11 @@ def test_the_camera_shows_the_block_as_many_steps_late_as_stated():
                 snapshot = env.save_state()
                 env.step(env.action_space.sample())
                 observation = env.restore_state(snapshot)
-            observation = env.step(rng.uniform(-1, 1, 4))[0]
+            observation, *_, info = env.step(rng.uniform(-1, 1, 4))
             true.append(env.state.object_position[0].copy())
+            state = env._core.state
+            assert info["moved"] is info["object_lost"] is env.task.moved(state).item()
+            assert info["reward_terms"]["approach"] == env.task.shaping(state)["approach"]
             env.state.object_position[:] = 5.0  # changes nothing that the camera shows
         expected = [true[max(0, k - delay)] for k in range(len(shown))]
         np.testing.assert_allclose(shown, expected, atol=1e-6)
