@@ -6,8 +6,8 @@ import pytest
 from episodes import expert_episode
 
 from tpm_gym import TPMEnv
-from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
-from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
+from tpm_gym.errors import ResetOptionError, UnreachableError
+from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.tasks import Conveyor
 from tpm_gym.tasks.conveyor import SPEEDS
 
