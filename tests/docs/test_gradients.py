@@ -191,5 +191,7 @@ def test_the_page_has_the_record_s_tables_and_its_code_runs():
         for kind in ("rms", "rms_pybullet")
         for some in (CARRIES[: draw_gradients.CARRIES], CARRIES[draw_gradients.CARRIES :])
     ]
-    stated = re.search(r"falls by (\d+)% on .* by (\d+)% on WIDE.*\((\d+) and (\d+)%\)", page)
+    stated = re.search(
+        r"falls by (\d+)% on .* by (\d+)% on WIDE \(in PyBullet by (\d+) and (\d+)%\)", page
+    )
     assert [f"{100 * share:.0f}" for share in saved] == list(stated.groups())

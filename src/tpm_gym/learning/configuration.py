@@ -80,7 +80,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment. The default "the id's" means that the environment id decides."""
+    """Options of an environment; the default "the id's" is the value in the environment id."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""
@@ -155,8 +155,7 @@ class TrainingConfig:
     """Weight of the singularity penalty in the reward; 0 for none."""
 
     goals: Literal["sampled", "tempting"] = "sampled"
-    """Places of goals: "sampled" is anywhere in the task region, "tempting" is only next to a
-    singularity of the robot."""
+    """Goals: sampled in the whole task region, or only next to a singularity (tempting)."""
 
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
@@ -173,8 +172,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the final test in each engine; 0 for no test. The test follows a training in
-    --engine analytic and runs the best policy in the analytic engine and in PyBullet."""
+    """Episodes of the best policy's test in the analytic engine, and of its test in PyBullet, after
+    a training in --engine analytic; 0 for no test."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so

@@ -446,7 +446,13 @@ class Task(ABC):
             ("position", "m", f"centre of the {name}, from a camera", centre, extent),
             ("offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near),
             ("velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed),
-            ("tilt", "-", f"x and y of the {name}'s axis", (0.0, 0.0), (1.0, 1.0)),
+            (
+                "tilt",
+                "-",
+                f"x and y of the unit vector along the {name}'s z axis",
+                (0.0, 0.0),
+                (1.0, 1.0),
+            ),
             (
                 "held",
                 "-",
