@@ -80,7 +80,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment; the default "the id's" is the value in the environment id."""
+    """Options of an environment. Default "the id's": the environment id decides."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""
