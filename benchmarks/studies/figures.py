@@ -114,7 +114,7 @@ def penalty(runs: Frame) -> Figure:
         axes.set_xlim(-0.5, len(found) - 0.5)
         axes.set_xticks(range(len(found)), weights)
         axes.set_xlabel("penalty weight")
-    _legend(figure, "a dot a seed")
+    _legend(figure, "each dot is a seed")
     return figure
 
 
@@ -144,7 +144,7 @@ def robustness(bisections: Sequence[Record]) -> Figure:
         ticks = sorted([nominal(attribute), *ends(attribute)])
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
-    _legend(figure, "a dot a test; success halves near the dashed lines")
+    _legend(figure, "each dot is a test; success halves near the dashed lines")
     return figure
 
 
