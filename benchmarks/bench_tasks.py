@@ -116,10 +116,7 @@ def lines(record: dict[str, Any]) -> Iterator[str]:
         ],
     )
     yield ""
-    yield (
-        f"{processor_line(record['conditions'])}; `make bench-tasks`. Some cells were measured by "
-        "the function `measure` of `benchmarks/bench_tasks.py`, with fewer episodes."
-    )
+    yield f"{processor_line(record['conditions'])}; `make bench-tasks`."
 
 
 def _conditions(other: dict[str, str]) -> tuple[str, str]:
