@@ -194,7 +194,7 @@ def _bisections(study: Study) -> list[Bisection]:
 
 
 def _trainings(study: Study) -> list[Run]:
-    # TQC takes two and a half times as long as SAC, and has not learned better.
+    # TQC takes almost twice as long as SAC, and has not learned better.
     usual = {"results": ("sac", "ppo"), "benchmark": ("ppo", "sac")}.get(study.plan, ("ppo",))
     runs = [
         run
