@@ -42,6 +42,7 @@ def env():
         {"reward": "none"},
         {"goals": "hard"},
         {"goals": "tempting", "machine": "wide"},
+        {"task": "juggle"},
         *({"engine": value} for value in ("havok", None, 3)),
         *({"machine": value} for value in ("hexapod", 3, object, Machine, {"name": "paper"})),
     ],
@@ -58,9 +59,10 @@ def test_bad_options_are_refused_by_name(options):
 def test_human_mode_without_a_display_is_refused_instead_of_ending_the_process(monkeypatch):
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
-    with pytest.raises(ConfigurationError, match="display") as caught:
-        TPMEnv(render_mode="human")
-    assert (caught.value.name, caught.value.value) == ("render_mode", "human")
+    for engine in ("pybullet", "mujoco", "analytic"):
+        with pytest.raises(ConfigurationError, match="display") as caught:
+            TPMEnv(engine=engine, render_mode="human")
+        assert (caught.value.name, caught.value.value) == ("render_mode", "human")
     env = TPMEnv()
     assert env.metadata["render_modes"] == list(RENDER_MODES[1:])
     assert TPMEnv.metadata["render_modes"] == list(RENDER_MODES)

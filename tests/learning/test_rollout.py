@@ -101,6 +101,9 @@ def test_record_says_what_happened():
         torque_peak=6.0,
     )
     assert record.as_dict()["return"] == -1.75
+    (record,) = run_episodes(Scripted([scripted_step(success=True)]), Idle(), 1, first_seed=0)
+    assert record.success_at_end
+    assert record.success_once
 
 
 def test_an_event_of_a_single_step_is_recorded():

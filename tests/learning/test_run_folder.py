@@ -45,7 +45,8 @@ def test_a_run_is_replaced_only_if_asked_to(run):
 
 def test_the_partial_file_of_a_killed_process_does_not_occupy_a_folder(tmp_path):
     (tmp_path / ".config.json").write_text("{")
-    prepare(tmp_path, overwrite=False)
+    prepare(tmp_path, overwrite=False)  # as for an empty folder, and nothing is deleted
+    assert names(tmp_path) == [".config.json"]
 
 
 @pytest.mark.parametrize("config", [None, '{"model_type": "bert"}', "{", "[]", '"text"'])

@@ -28,8 +28,11 @@ def loaded(payload, machine=PAPER_TPM):
 def test_the_payload_is_a_mass_at_p(payload):
     machine = replace(PAPER_TPM, payload=payload)
     motion = np.array([PAPER_TPM.inverse(PAPER_TPM.home), (1.0, 2.0, -1.0), (30.0, -20.0, 10.0)])
-    expected = machine.dynamics.torque(*motion)
-    assert_allclose(machine.torque(*motion), expected, rtol=1e-12)
+    expected = replace(PAPER_TPM.dynamics, payload=payload).torque(*motion)
+    for torque in (machine.torque, machine.dynamics.torque):
+        assert_allclose(torque(*motion), expected, rtol=1e-12)
+    added = machine.mechanism.link("platform").mass - PAPER_TPM.mechanism.link("platform").mass
+    assert added == pytest.approx(payload)
 
 
 @pytest.mark.parametrize("payload", [-0.1, np.nan, "1"])
