@@ -23,6 +23,9 @@ from tpm_gym.learning.environments import make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.policies import load_policy
 from tpm_gym.learning.rollout import TEST_SEED, run_episodes
+from tpm_gym.mechanism import PAPER_TPM, WIDE_TPM
+from tpm_gym.simulation import Randomisation, Servo
+from tpm_gym.tasks import Reach
 
 REACH, PICK = "TPMReachDense-v0", "TPMPickAndPlace-v0"
 FIRST, STEPS = 7, 40_960  # of replay: ten updates
@@ -219,3 +222,45 @@ def test_an_id_that_names_no_task_is_collected_with_the_default_one(tmp_path):
         )
         (folder,) = collect(config(tmp_path, "expert", env="Plain-v0", episodes=2), quiet())
     assert minari.MinariDataset(folder / "data").total_steps == 10
+
+
+OWN = replace(PAPER_TPM, name="own", table=(0.4, 0.3))
+
+
+class Unregistered(Reach):
+    """A task that no name stands for."""
+
+
+@pytest.mark.parametrize(
+    ("options", "refused"),
+    [
+        ({"machine": OWN}, "cannot store its machine, 'own', .*tpm_gym.register_machine"),
+        ({"task": Unregistered}, "cannot store its task, .*Unregistered.*tpm_gym.register_task"),
+        ({"machine": WIDE_TPM, "task": Reach}, None),  # registered under names
+        ({"drive": Servo(stiffness=5000.0), "randomisation": Randomisation(latency=1)}, None),
+    ],
+)
+def test_the_environment_of_an_own_id_is_recovered_or_refused_early(tmp_path, options, refused):
+    spec = gym.spec(REACH)
+    with registries_put_back():
+        gym.register(
+            "Own-v0",
+            entry_point=spec.entry_point,
+            vector_entry_point=spec.vector_entry_point,
+            max_episode_steps=5,
+            kwargs={**spec.kwargs, **options},
+        )
+        given = config(tmp_path, "random", env="Own-v0", episodes=1)
+        if refused:
+            with pytest.raises(ConfigError, match=refused):
+                collect(given, quiet())
+            assert list(tmp_path.iterdir()) == []
+            return
+        (folder,) = collect(given, quiet())
+        with (
+            closing(minari.MinariDataset(folder / "data").recover_environment()) as env,
+            closing(gym.make("Own-v0", engine="analytic")) as own,
+        ):
+            env.reset(seed=0)
+            own.reset(seed=0)
+            own.unwrapped.restore_state(env.unwrapped.save_state())  # of an equal environment

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+from gymnasium.wrappers import TransformReward
 from processes import PYTHON, printed_by
 from registries import registries_put_back
 from trainings import SAC_RECIPE, interrupt_at, uninterrupted
@@ -21,6 +22,7 @@ from tpm_gym.learning.environments import check_env_id, make_env
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.policy.files import digest
 from tpm_gym.resources import POLICIES
+from tpm_gym.simulation import Servo
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -62,6 +64,52 @@ def test_an_id_of_a_users_module_is_trained_in_workers_resumed_and_evaluated(tmp
     assert content["env"] == "my_tasks:TPMMine-v0"
     assert content["env_options"]["machine"] == "mine"  # as in training
     assert [policy["records"][0]["length"] for policy in content["policies"]] == [20, 20]
+
+
+OWN_ID = """
+import gymnasium as gym
+import tpm_gym
+
+spec = gym.spec("TPMReach-v0")
+gym.register(
+    "OwnReach-v0",
+    entry_point=spec.entry_point,
+    vector_entry_point=spec.vector_entry_point,
+    max_episode_steps=20,
+    kwargs={
+        **spec.kwargs,
+        "drive": "servo",
+        "goals": "tempting",
+        "penalty_weight": 0.5,
+        "randomisation": {"latency": 1},
+    },
+)
+"""
+
+
+@pytest.mark.usefixtures("needs_pybullet")
+def test_what_an_id_sets_holds_in_training_and_goes_with_the_policy(tmp_path, run, monkeypatch):
+    (tmp_path / "own_id.py").write_text(OWN_ID)
+    (tmp_path / "sac.yml").write_text(SAC_RECIPE.format(env="OwnReach-v0", train_freq=5))
+    made = []
+    make = gym.make_vec
+    monkeypatch.setattr(gym, "make_vec", lambda *a, **k: made.append(make(*a, **k)) or made[-1])
+    words = ["--env", "own_id:OwnReach-v0", "--recipe", "sac.yml", "--envs", "2"]
+    words += ["--steps", "120", "--eval-episodes", "1"]
+    run("train", *words)
+    for envs in made:
+        assert (envs.drive, envs.randomisation.latency) == (Servo(), 1)
+        assert (envs.task.goals, envs.task.penalty_weight) == ("tempting", 0.5)
+    folder = tmp_path / "runs" / "OwnReach-v0-sac-s0"
+    content = json.loads((folder / "config.json").read_text())
+    assert (content["goals"], content["penalty_weight"]) == ("tempting", 0.5)
+    run("export", str(folder / "best.zip"), "again", "--trust-pickle")
+    for policy in (folder / "best.json", "again.json"):
+        words = ["--policy", str(policy), "--env", "TPMReach-v0"]
+        run("evaluate", *words, "--episodes", "1", "--json", "out.json")
+        content = json.loads((tmp_path / "out.json").read_text())
+        assert content["env_options"]["drive"] == "servo"
+        assert (content["goals"], content["penalty_weight"]) == ("sampled", 1.0)
 
 
 def test_a_module_that_another_file_hides_is_named():
@@ -141,6 +189,11 @@ def test_a_class_that_derives_from_ours_is_accepted_however_it_is_registered():
             with pytest.raises(ConfigError, match=f"Mine-v0 is registered without .*{name}"):
                 check_env_id("Mine-v0")
             del gym.registry["Mine-v0"]
+        wrapped = (TransformReward.wrapper_spec(func=None),)
+        gym.register(id="Mine-v0", **registration, **needed, additional_wrappers=wrapped)
+        with pytest.raises(ConfigError, match="with the wrappers TransformReward, which vector"):
+            check_env_id("Mine-v0")
+        del gym.registry["Mine-v0"]
         gym.register(id="Mine-v0", **registration, **needed)
         env = make_env(check_env_id("Mine-v0"), penalty_weight=0.5)
         assert isinstance(env.unwrapped, Mine)

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -287,6 +288,104 @@ def test_a_policy_is_evaluated_on_its_own_machine_and_drive_unless_others_are_gi
         evaluate(EvaluationConfig(both, episodes=1), quiet())
     chosen = EnvOptions("paper", drive="ideal")
     evaluate(EvaluationConfig(both, episodes=1, env_options=chosen), quiet())
+
+
+@pytest.fixture
+def own_id() -> Iterator[Any]:
+    """Return a function that registers ids of Reach with options of their own."""
+
+    def register(name: str, **options: Any) -> str:
+        spec = gym.spec("TPMReach-v0")
+        gym.register(
+            name,
+            entry_point=spec.entry_point,
+            vector_entry_point=spec.vector_entry_point,
+            max_episode_steps=3,
+            kwargs={**spec.kwargs, **options},
+        )
+        return name
+
+    with registries_put_back():
+        yield register
+
+
+def evaluated(policy: Path, env: str | None, out: Path, **options: Any) -> dict[str, str]:
+    given = EnvOptions(**options)
+    evaluate(EvaluationConfig((str(policy),), env, 1, json=out, env_options=given), quiet())
+    return read_strict(out)["env_options"]
+
+
+OTHER = replace(tpm_gym.PAPER_TPM, table=(0.4, 0.3))  # another machine of the name "paper"
+
+
+@pytest.mark.parametrize(
+    ("options", "elsewhere"),
+    [
+        ({"machine": "wide", "drive": "servo"}, {"machine": "wide", "drive": "servo"}),
+        ({"machine": tpm_gym.WIDE_TPM}, {"machine": "wide"}),
+        ({"shield": True}, {"shield": "True"}),
+        ({"machine": OTHER}, r"machine = 'paper \([0-9a-f]{8}\)' is not possible"),
+        ({"machine": replace(OTHER, name="ångström")}, r"machine = .*ngstr.* is not possible"),
+    ],
+)
+@pytest.mark.parametrize("registered", [True, False])
+def test_a_policy_keeps_the_conditions_of_its_id_in_every_id(
+    options, elsewhere, registered, run, own_id, tmp_path
+):
+    from tpm_gym.learning import export
+
+    own, out = own_id("OwnReach-v0", **options), tmp_path / "out.json"
+    model = export.load_model(run / "best.zip", "ppo")
+    export.save(model, tmp_path / "best", env_id=own, seed=0, recipe={})
+    nominal = evaluated(run / "best.json", "TPMReach-v0", out)
+    at_home = evaluated(tmp_path / "best.json", own, out)
+    assert at_home["machine"] != "paper" or "shield" in at_home
+    if not registered:
+        del gym.registry[own]
+    if isinstance(elsewhere, str):
+        with pytest.raises(ConfigurationError, match=elsewhere):
+            evaluated(tmp_path / "best.json", "TPMReach-v0", out)
+        assert evaluated(tmp_path / "best.json", "TPMReach-v0", out, machine="paper") == nominal
+        return
+    assert evaluated(tmp_path / "best.json", "TPMReach-v0", out) == nominal | elsewhere
+
+
+def test_a_policy_of_an_older_file_has_the_conditions_of_its_id(run, own_id, tmp_path):
+    own, out = own_id("OwnReach-v0", machine="wide"), tmp_path / "out.json"
+    shutil.copytree(run, tmp_path / "run")
+    path = tmp_path / "run" / "best.json"
+    content = json.loads(path.read_text()) | {"env": own}
+    path.write_text(json.dumps({**content, "sha256": digest(content)}))
+    assert evaluated(path, "TPMReach-v0", out)["machine"] == "wide"
+    assert evaluated(run / "best.json", own, out)["machine"] == "paper"
+    assert evaluated(run / "best.json", own, out, machine="wide")["machine"] == "wide"
+
+
+def test_a_machine_of_an_id_without_a_registered_name_can_be_chosen_by_its_own(
+    run, own_id, tmp_path
+):
+    own = own_id("OwnReach-v0", machine=replace(OTHER, name="nowhere registered"))
+    out = tmp_path / "out.json"
+    found = evaluated(run / "best.json", own, out, machine="nowhere registered")
+    assert found["machine"] == "nowhere registered"
+
+
+def test_goals_penalty_and_randomisation_of_an_id_hold_unless_others_are_given(
+    own_id, tmp_path, monkeypatch
+):
+    own = {"goals": "tempting", "penalty_weight": 0.0, "randomisation": {"latency": 1}}
+    env, out, made = own_id("OwnReach-v0", **own), tmp_path / "out.json", []
+    make = gym.make_vec
+    monkeypatch.setattr(gym, "make_vec", lambda *a, **k: made.append(make(*a, **k)) or made[-1])
+    for given in ({}, {"goals": "sampled", "penalty_weight": 1.0, "randomisation": ("latency=2",)}):
+        evaluate(EvaluationConfig(("expert",), env, 1, json=out, **given), quiet())
+        latency = 2 if given else 1
+        expected = {**own, **given, "randomisation": {"latency": latency}}
+        content = read_strict(out)
+        assert {name: content[name] for name in own} == expected
+        task = made[-1].task
+        assert (task.goals, task.penalty_weight) == (expected["goals"], expected["penalty_weight"])
+        assert made[-1].randomisation.latency == latency
 
 
 @pytest.mark.parametrize(

@@ -311,7 +311,18 @@ def test_mistakes_on_the_command_line_are_one_line(run, words, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("entry", "value"), [("env_options", "wide"), ("algo", ["sac"])])
+def test_options_that_the_id_of_a_run_set_are_written_where_it_is_not_registered(run):
+    config = json.loads((run / "config.json").read_text())
+    config |= {"env": "Unknown-v0", "id_options": {"machine": "delta", "drive": "servo"}}
+    (run / "config.json").write_text(json.dumps(config))
+    main(["export", str(run / "best.zip"), str(run / "out"), "--trust-pickle"])
+    about = tpm_gym.load_policy(run / "out").description
+    assert about.env_options == {"machine": "wide", "drive": "servo"}
+
+
+@pytest.mark.parametrize(
+    ("entry", "value"), [("env_options", "wide"), ("id_options", "wide"), ("algo", ["sac"])]
+)
 def test_a_damaged_configuration_beside_an_archive_is_named(run, entry, value):
     config = json.loads((run / "config.json").read_text())
     (run / "config.json").write_text(json.dumps({**config, entry: value}))

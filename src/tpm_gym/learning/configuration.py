@@ -11,7 +11,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from tyro.constructors import PrimitiveConstructorSpec
 
 from tpm_gym.learning.algorithms import ALGORITHMS
-from tpm_gym.learning.environments import check_env_id, import_module_of
+from tpm_gym.learning.environments import check_env_id, import_module_of, set_by
 from tpm_gym.learning.errors import ConfigError, RunError
 from tpm_gym.learning.recipes import (
     Recipe,
@@ -39,7 +39,12 @@ def unset(kind: Any, shown: str, metavar: str, name: str | None = None) -> Any:
     )
 
 
-_RANDOMISED = tyro.conf.arg(metavar="KEY=VALUE ...", help_behavior_hint="(default: none)")
+GOALS: Final = unset(
+    Literal["sampled", "tempting"], "the id's, mostly sampled", "{sampled,tempting}"
+)
+_RANDOMISED = tyro.conf.arg(
+    metavar="KEY=VALUE ...", help_behavior_hint="(default: the id's, mostly none)"
+)
 Randomised = Annotated[tuple[str, ...], _RANDOMISED]
 
 
@@ -111,6 +116,16 @@ class EnvOptions:
         return {name: value for name, value in vars(self).items() if value is not UNSET}
 
 
+OF_TASK: Final[Mapping[str, Any]] = {"goals": "sampled", "penalty_weight": 1.0}
+"""Options of a task, and their values if the registration of an id does not set them."""
+
+
+def of_task(env_id: str) -> dict[str, Any]:
+    """Return goals and penalty weight of an id."""
+    own = set_by(env_id) or {}
+    return {name: own.get(name, usual) for name, usual in OF_TASK.items()}
+
+
 GivenEnvOptions = Annotated[
     tyro.conf.OmitArgPrefixes[EnvOptions], tyro.conf.arg(name="environment")
 ]
@@ -151,10 +166,10 @@ class TrainingConfig:
     run: Annotated[Path, unset(Path, "runs/<env>-<algo>-s<seed>", "FOLDER")] = UNSET
     """Folder of the run."""
 
-    penalty_weight: float = 1.0
+    penalty_weight: Annotated[float, unset(float, "the id's, mostly 1", "FLOAT")] = UNSET
     """Weight of the singularity penalty in the reward; 0 for none."""
 
-    goals: Literal["sampled", "tempting"] = "sampled"
+    goals: Annotated[Literal["sampled", "tempting"], GOALS] = UNSET
     """Goals: sampled in the whole task region, or only next to a singularity (tempting)."""
 
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
@@ -213,11 +228,10 @@ class TrainingConfig:
         """Arguments of :func:`~tpm_gym.learning.environments.make_env`."""
         # A worker process must import the id's module, and may not have the id registered.
         env = self.env if ":" in self.env else check_env_id(self.env)
-        found: dict[str, Any] = {
-            "env": env,
-            "penalty_weight": self.penalty_weight,
-            "goals": self.goals,
-        }
+        found: dict[str, Any] = {"env": env}
+        for name in OF_TASK:
+            if (value := getattr(self, name)) is not UNSET:
+                found[name] = value
         if self.randomisation:
             found["randomisation"] = parse_randomisation(self.randomisation)
         return found | self.env_options.given()
@@ -285,6 +299,7 @@ def complete(config: TrainingConfig) -> TrainingConfig:
         "recipe_file": file,
         "run": Path("runs", f"{config.env.rpartition(':')[2]}-{config.algo}-s{config.seed}"),
         "eval_episodes": 200 if many else 20,
+        **of_task(config.env),
     }
     missing = {name: v for name, v in computed.items() if getattr(config, name) is UNSET}
     config = replace(config, recipe=recipe, **missing)

@@ -14,7 +14,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
@@ -22,10 +22,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, get_args
 import gymnasium as gym
 import numpy as np
 import tyro
+from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 from rich.console import Console
 
 import tpm_gym
+from tpm_gym.errors import TPMError, brief
 from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import (
     UNSET,
@@ -50,7 +52,8 @@ from tpm_gym.learning.rollout import (
     run_episodes,
     summarise,
 )
-from tpm_gym.tasks.registry import make_task
+from tpm_gym.mechanism.machine import Machine, find_machine, machine_names
+from tpm_gym.tasks.registry import TASKS, make_task
 from tpm_gym.tasks.task import Task
 
 if TYPE_CHECKING:
@@ -205,7 +208,55 @@ def _complete(config: CollectConfig) -> list[str]:
         import_module_of(env)
         if not _has_expert(env):
             raise ConfigError(f"--env {env}: its task has no expert; give it a plan")
+        _require_recoverable(env, config.env_options)
     return list(config.env)
+
+
+def _stored(env: str, options: EnvOptions) -> EnvSpec:
+    """Return the registration that a dataset stores: the id's, with the options of the command.
+
+    A machine and a task are stored by the names under which they are registered, if they are.
+    """
+    spec = copy.deepcopy(check_env_id(env))
+    spec.kwargs |= options.given()
+    if isinstance(machine := spec.kwargs.get("machine"), Machine):
+        names = (name for name in machine_names() if find_machine(name) == machine)
+        spec.kwargs["machine"] = next(names, machine)
+    if isinstance(task := spec.kwargs.get("task"), type):
+        names = (name for name, kind in TASKS.items() if kind is task)
+        spec.kwargs["task"] = next(names, task)
+    return spec
+
+
+def _require_recoverable(env: str, options: EnvOptions) -> None:
+    """Refuse an environment that could not be made from the dataset, or would be another one."""
+    spec = _stored(env, options)
+    for name, value in spec.kwargs.items():
+        try:
+            found = EnvSpec.from_json(replace(spec, kwargs={name: value}).to_json()).kwargs
+        except (TypeError, ValueError):  # no JSON
+            found = {}
+        if found == {name: value}:
+            continue
+        both = [{**spec.kwargs, **found}, spec.kwargs] if found else []
+        try:
+            kinds = [_kind(replace(spec, kwargs=kwargs)) for kwargs in both]
+        except TPMError:
+            kinds = []
+        if not kinds or kinds[0] != kinds[1]:
+            shown, way = getattr(value, "name", brief(value)), "register an id with plain data"
+            if name in ("machine", "task"):
+                way = f"register the {name} with tpm_gym.register_{name}"
+            raise ConfigError(
+                f"--env {env}: a dataset cannot store its {name}, {shown!r}, so the environment "
+                f"could not be recovered; {way}"
+            )
+
+
+def _kind(spec: EnvSpec) -> Any:
+    """Return task and options of an environment."""
+    with closing(make_envs(spec, 1)) as envs:
+        return envs.kind
 
 
 def _has_expert(env: str) -> bool:
@@ -309,8 +360,7 @@ def _write(dataset: Dataset, scores: tuple[float, float], console: Console) -> s
     """Write a dataset under a temporary name and move it; return its digest."""
     from minari.dataset.minari_storage import MinariStorage
 
-    spec = copy.deepcopy(check_env_id(dataset.env))
-    spec.kwargs |= dataset.config.env_options.given()
+    spec = _stored(dataset.env, dataset.config.env_options)
     with closing(gym.make(spec)) as env:
         spaces = env.observation_space, env.action_space
     # Minari cannot write to a relative path.

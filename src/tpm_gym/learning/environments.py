@@ -4,8 +4,10 @@ import importlib
 import os
 import signal
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
-from typing import Any
+from hashlib import sha256
+from typing import Any, Final
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, load_env_creator
@@ -15,6 +17,15 @@ from tpm_gym.envs.single import TPMEnv
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.rollout import GoalEnv
+from tpm_gym.mechanism.machine import Machine, find_machine, machine_names
+
+USUAL: Final[Mapping[str, Any]] = {
+    "machine": "paper",
+    "engine": "pybullet",
+    "drive": "ideal",
+    "shield": False,
+}
+"""Conditions of an id whose registration does not set them."""
 
 
 def import_module_of(env_id: str) -> None:
@@ -46,7 +57,7 @@ def check_env_id(env_id: str) -> EnvSpec:
     Raises:
         ConfigError: The module is not imported, the id is not registered, its environment is not
             derived from ``TPMEnv``, its vector environment is not derived from ``TPMVectorEnv``, or
-            its registration has no ``max_episode_steps``.
+            its registration has no ``max_episode_steps``, or has wrappers.
     """
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
@@ -69,7 +80,46 @@ def check_env_id(env_id: str) -> EnvSpec:
             f"{env_id} is registered without vector_entry_point or max_episode_steps; register it "
             f"with vector_entry_point={VECTOR_ENTRY_POINT!r} and the steps of an episode"
         )
+    if spec.additional_wrappers:
+        names = ", ".join(wrapper.name for wrapper in spec.additional_wrappers)
+        raise ConfigError(
+            f"{env_id} is registered with the wrappers {names}, which vector environments do not "
+            "have; register it without additional_wrappers"
+        )
     return spec
+
+
+def set_by(env_id: str) -> dict[str, Any] | None:
+    """Return the options that the registration of an id sets, as in ``{"machine": "wide"}``.
+
+    Nothing is imported. The result is None if no id of this name is registered.
+    """
+    spec = gym.registry.get(env_id.rpartition(":")[2])
+    if spec is None:
+        return None
+    return {name: value for name, value in spec.kwargs.items() if value is not None}
+
+
+def named(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return machine, engine, drive and shield of some options, as plain data for files.
+
+    A machine is named. If another machine is registered under its name, the name gets a suffix, so
+    that the name never stands for the wrong machine.
+    """
+    found = {name: options[name] for name in USUAL if name in options}
+    if isinstance(machine := found.get("machine"), Machine):
+        found["machine"] = machine.name
+        if machine.name in machine_names() and find_machine(machine.name) != machine:
+            found["machine"] += f" ({sha256(repr(machine).encode()).hexdigest()[:8]})"
+    return {
+        name: value if isinstance(value, bool | float) else _printable(str(value))
+        for name, value in found.items()
+    }
+
+
+def _printable(text: str) -> str:
+    """Return a text as policy files take it: at most 100 printable characters of ASCII."""
+    return text.encode("unicode_escape").decode()[:100]
 
 
 def _derives(entry: Any, kind: type) -> bool:

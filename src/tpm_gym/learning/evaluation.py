@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,20 +17,31 @@ from rich.table import Table
 from tpm_gym.envs.vector import TPMVectorEnv
 from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import (
+    GOALS,
+    OF_TASK,
     UNSET,
     EnvOptions,
     GivenEnvOptions,
     Randomised,
     check_least,
+    of_task,
     parse_randomisation,
     unset,
 )
-from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
+from tpm_gym.learning.environments import (
+    USUAL,
+    check_env_id,
+    import_module_of,
+    make_envs,
+    named,
+    set_by,
+)
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.estimates import Estimate
 from tpm_gym.learning.film import Frame, Play, write_contact_sheet, write_video
 from tpm_gym.learning.policies import load_policy, trained_in
 from tpm_gym.learning.rollout import BATCH, TEST_SEED, Episode, Policy, run_episodes, summarise
+from tpm_gym.simulation.randomisation import Randomisation
 
 _SHARE = (100.0, "{:.1f}", "%")  # factor, format and unit
 # Label, key, factor, format and unit of each row of the table; the task's events are in between.
@@ -69,11 +80,11 @@ class EvaluationConfig:
     """Seed of the first episode. Training, and the choice of the best policy, use seeds below the
     default seed."""
 
-    goals: Literal["sampled", "tempting"] = "sampled"
+    goals: Annotated[Literal["sampled", "tempting"], GOALS] = UNSET
     """Places of goals: "sampled" is anywhere in the task region, "tempting" is only next to a
     singularity of the robot."""
 
-    penalty_weight: float = 1.0
+    penalty_weight: Annotated[float, unset(float, "the id's, mostly 1", "FLOAT")] = UNSET
     """Weight of the singularity penalty in the return."""
 
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
@@ -166,7 +177,8 @@ def _check(config: EvaluationConfig) -> None:
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
     """Complete the options.
 
-    If env, machine, drive or shield is not given, its value is taken from the policies.
+    If env, machine, drive or shield is not given, its value is taken from the policies. Goals and
+    penalty weight are then those of the environment id.
     """
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     if config.env is UNSET:
@@ -178,13 +190,14 @@ def _complete(config: EvaluationConfig) -> EvaluationConfig:
         import_module_of(env_id)
     given, usual = config.env_options.given(), _conditions(env_id, {})
     for name in ("machine", "drive", "shield"):
-        if name in given:
-            continue
-        own = usual.get(name, False)
-        values = {spec: options.get(name, own) for spec, (_, options) in trained.items()}
-        if values and (value := _common(name, values)) != own:
-            given[name] = value
-    return replace(config, env=env_id, env_options=EnvOptions(**given))
+        values = {spec: found[name] for spec, (_, found) in trained.items() if name in found}
+        if values and name not in given:
+            given[name] = _common(name, values)
+        if given.get(name) == usual[name]:  # a machine of the id may have no registered name
+            del given[name]
+    usual = of_task(env_id)
+    missing = {name: value for name, value in usual.items() if getattr(config, name) is UNSET}
+    return replace(config, env=env_id, env_options=EnvOptions(**given), **missing)
 
 
 def _common(option: str, values: Mapping[str, Any]) -> Any:
@@ -197,24 +210,27 @@ def _common(option: str, values: Mapping[str, Any]) -> Any:
     return found.pop()
 
 
-def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, str]:
-    """Return the names of machine, engine and drive, and the shield if one is given.
+def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the names of machine, engine and drive, and the shield.
 
-    A name that is not given is the default of ``env_id``.
+    A value that is not given is the default of ``env_id``.
     """
-    usual = {"machine": "paper", "engine": "pybullet", "drive": "ideal"}
-    if given.get("shield"):
-        usual["shield"] = ""
-    own = check_env_id(env_id).kwargs
-    found = {name: given.get(name) or own.get(name) or value for name, value in usual.items()}
-    return {name: str(getattr(value, "name", value)) for name, value in found.items()}
+    check_env_id(env_id)
+    return {**USUAL, **named(set_by(env_id) or {}), **given}
+
+
+def _shown(config: EvaluationConfig) -> dict[str, str]:
+    """Return the conditions for table and JSON; without a shield, it is left out."""
+    found = _conditions(config.env, config.env_options.given())
+    return {name: str(value) for name, value in found.items() if value is not False}
 
 
 def _make_envs(
     config: EvaluationConfig, count: int, render_mode: str | None = None
 ) -> TPMVectorEnv:
-    options: dict[str, Any] = {name: getattr(config, name) for name in ("goals", "penalty_weight")}
-    options["randomisation"] = parse_randomisation(config.randomisation)
+    options: dict[str, Any] = {name: getattr(config, name) for name in OF_TASK}
+    if config.randomisation:
+        options["randomisation"] = parse_randomisation(config.randomisation)
     options |= config.env_options.given()
     pictures = {"render_mode": render_mode, "camera": config.camera}
     return make_envs(config.env, count, **pictures, **options)
@@ -243,8 +259,7 @@ def bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], obj
 
 def _table(config: EvaluationConfig, results: Sequence[Result]) -> Table:
     """Lay the metrics out with a column per policy."""
-    conditions = _conditions(config.env, config.env_options.given())
-    where = ", ".join(f"{name} {value}" for name, value in conditions.items())
+    where = ", ".join(f"{name} {value}" for name, value in _shown(config).items())
     seeds = f"seeds {config.seed} to {config.seed + config.episodes - 1}"
     table = Table(
         title=f"{config.env} ({where}): {config.episodes} episodes, {seeds}",
@@ -278,12 +293,20 @@ def _description(config: EvaluationConfig, results: Sequence[Result]) -> dict[st
     recorded = ("env", "episodes", "seed", "goals", "penalty_weight")
     return {
         **{name: getattr(config, name) for name in recorded},
-        "randomisation": parse_randomisation(config.randomisation),
-        "env_options": _conditions(config.env, config.env_options.given()),
+        "randomisation": _randomisation(config),
+        "env_options": _shown(config),
         **content,
         **provenance.origin(),
         **records,
     }
+
+
+def _randomisation(config: EvaluationConfig) -> Any:
+    """Return the given randomisation, or that of the environment id, as plain data."""
+    if config.randomisation:
+        return parse_randomisation(config.randomisation)
+    own = (set_by(config.env) or {}).get("randomisation", {})
+    return asdict(own) if isinstance(own, Randomisation) else own
 
 
 def paths_per_policy(path: Path, policies: Sequence[str]) -> list[Path]:

@@ -18,11 +18,12 @@ from safetensors.numpy import save as safetensors_bytes
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from torch import nn
-from typing_extensions import TypedDict
+from typing_extensions import NotRequired, TypedDict
 
 from tpm_gym import TPMError, load_policy
 from tpm_gym.learning import model_card, provenance
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES, Actor
+from tpm_gym.learning.environments import named, set_by
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.features import GoalGapExtractor
 from tpm_gym.learning.policies import refused
@@ -49,6 +50,7 @@ class _Origin(TypedDict):
     seed: int
     recipe: dict[str, Any]
     env_options: dict[str, Any]
+    id_options: NotRequired[dict[str, Any]]
     versions: dict[str, Any]
 
 
@@ -73,7 +75,7 @@ def save(
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Path of the files without their endings. An earlier policy is replaced.
         env_options: Machine, engine, drive and shield of the training. Options that are left out
-            have the defaults of ``env_id``.
+            are those of ``env_id``, which are written too if its registration sets them.
         versions: Versions at training; by default the installed ones.
 
     Raises:
@@ -93,7 +95,7 @@ def save(
             "format": FORMAT,
             "version": VERSION,
             "env": env_id,
-            "env_options": dict(env_options or {}),
+            "env_options": {**named(set_by(env_id) or {}), **(env_options or {})},
             "algorithm": algorithm,
             "seed": seed,
             "steps": model.num_timesteps,
@@ -186,7 +188,9 @@ def convert(
         way = "keep the file in an intact run folder"
         raise refused(name, f"{CONFIG_FILE} of its run is damaged: {problem}; {way}") from error
     _check_card(path, config["env"], evaluation)
-    about = {key: config[key] for key in ("seed", "recipe", "env_options")}
+    about = {key: config[key] for key in ("seed", "recipe")}
+    # The id may not be registered here.
+    about["env_options"] = {**config.get("id_options", {}), **config["env_options"]}
     model = load_model(archive, config["algo"])
     return save(model, path, env_id=config["env"], versions=config["versions"], **about)
 

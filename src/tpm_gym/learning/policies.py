@@ -11,6 +11,7 @@ import numpy as np
 
 import tpm_gym
 from tpm_gym import TPMError
+from tpm_gym.learning.environments import USUAL, named, set_by
 from tpm_gym.learning.errors import PolicyError
 from tpm_gym.learning.rollout import Action, Observation, Policy
 from tpm_gym.resources import POLICIES
@@ -121,11 +122,17 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
 
 
 def trained_in(spec: str) -> tuple[str, dict[str, Any]] | None:
-    """Return environment id and options of a policy's training; None for expert and random."""
+    """Return environment id and conditions of a policy's training; None for expert and random.
+
+    A condition that the file does not hold is that of the environment id. It is left out if the id
+    is not registered.
+    """
     if spec in SCRIPTED:
         return None
     about = _exported(spec).description
-    return about.env_id, {str(name): value for name, value in about.env_options.items()}
+    own = set_by(about.env_id)
+    found = {**USUAL, **named(own)} if own is not None else {}
+    return about.env_id, found | {str(name): value for name, value in about.env_options.items()}
 
 
 def refused(spec: str, problem: str) -> PolicyError:

@@ -30,7 +30,14 @@ from tpm_gym.learning.algorithms import ALGORITHMS
 from tpm_gym.learning.checkpoint import CheckpointStore, Content
 from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, complete, resumed
 from tpm_gym.learning.demonstrations import Demonstrations
-from tpm_gym.learning.environments import check_env_id, import_module_of, make_env, make_envs
+from tpm_gym.learning.environments import (
+    check_env_id,
+    import_module_of,
+    make_env,
+    make_envs,
+    named,
+    set_by,
+)
 from tpm_gym.learning.errors import (
     CheckpointError,
     ConfigError,
@@ -107,6 +114,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
         _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
     description = {
         **config.record(),
+        "id_options": named(set_by(config.env) or {}),
         "training_seeds": [config.seed, config.seed + config.envs - 1],
         "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
         **provenance.origin(),
