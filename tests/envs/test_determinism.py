@@ -139,6 +139,24 @@ def test_the_state_after_saving_or_copying_is_that_of_the_snapshot_or_copy():
             assert bits(vars(other.simulation.state().take(0))) == bits(vars(bare.state))
 
 
+@pytest.mark.usefixtures("needs_pybullet")
+def test_a_copy_goes_on_equally_while_a_block_leaves_the_belt():
+    """Bullet moves the belt in a time step; its end must not stay ahead where contacts begin."""
+    with closing(make("TPMConveyorDense-v0", max_episode_steps=1000)) as env:
+        bare, still = env.unwrapped, np.zeros(4, np.float32)
+        bare.reset(seed=10)
+        for step in range(29):
+            bare.step(still)
+            if step < 23:
+                continue
+            with closing(copy.deepcopy(bare)) as other:
+                bare.step(still)
+                other.step(still)
+                assert bits(vars(bare.state)) == bits(vars(other.state))
+        end = bare.task.scene.belt.end
+        assert abs(end - bare.state.object_position[0, 0]) < bare.task.scene.objects[0].width / 2
+
+
 def test_a_second_snapshot_of_the_same_moment_changes_nothing():
     # Bullet normalises the turned block's quaternion each time that it is placed.
     with closing(make("TPMPush-v0")) as env:

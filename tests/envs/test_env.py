@@ -240,6 +240,9 @@ def test_a_snapshot_of_another_kind_of_environment_is_refused(env):
     others: list[dict[str, Any]] = [
         {"task": "reach"},
         {"machine": "wide"},
+        {"reward": "dense"},
+        {"goals": "tempting"},
+        {"penalty_weight": 0.5},
         {"control": "joints"},
         {"engine": "analytic"},
         {"drive": "servo"},

@@ -141,6 +141,9 @@ class Core:
         self._engine = {"engine": engine, "physics": physics, "gui": gui, "renderer": renderer}
         self.kind = {
             "task": type(self.task),
+            "reward": self.task.reward,
+            "goals": self.task.goals,
+            "penalty_weight": self.task.penalty_weight,
             "control": control,  # of the delayed actions
             "machine": self.machine,
             "engine": engine,

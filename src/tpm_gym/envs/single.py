@@ -113,8 +113,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Reward
 
-    ``goal`` term + ``singularity`` term (+ in dense rewards ``approach`` where there are objects,
-    or ``gate`` in Cycle).
+    ``goal`` term + ``singularity`` term (+ ``gate`` in Cycle, and in dense rewards ``approach``
+    where there are objects). In Stack, the distance is that of the block farther from its goal, and
+    the cup approaches the upper block.
 
     | term | value |
     | --- | --- |
@@ -424,8 +425,9 @@ class TPMEnv(gym.Env[Observation, Action]):
     def save_state(self) -> EnvSnapshot:
         """Return physics, rng, goal, delayed actions and grasp.
 
-        Steps from here and steps after :meth:`restore_state` agree in every bit. The step count of
-        the wrapper ``TimeLimit`` is not part of the snapshot.
+        Steps from here and steps after :meth:`restore_state` agree in every bit; with two blocks in
+        PyBullet, to rounding. The step count of the wrapper ``TimeLimit`` is not part of the
+        snapshot.
 
         Raises:
             EpisodeError: If no episode is running.

@@ -21,7 +21,8 @@ class ViewConfig:
     """Show the robot in the browser: drag it, see its singularities, and play episodes."""
 
     machine: str = "paper"
-    """Machine that is shown first: paper, wide, delta, or another registered machine."""
+    """Machine that is shown first: paper, wide or delta. For a machine of your own, use
+    tpm_gym.viewer.open_viewer in Python."""
 
     host: str = "127.0.0.1"
     """Address to listen on. With the default, only this computer can open the page."""

@@ -122,12 +122,18 @@ class Scenery:
         A belt is a static body with a velocity, so that contacts carry blocks along. Bullet also
         moves the body by this velocity; therefore the place is set each time.
         """
+        self._place_belts()
+        for belt in self.belts:
+            self._client.resetBaseVelocity(belt, (self.belt_speed, 0.0, 0.0))
+
+    def _place_belts(self) -> None:
         for belt, place in zip(self.belts, self._belt_places, strict=True):
             self._client.resetBasePositionAndOrientation(belt, *place)
-            self._client.resetBaseVelocity(belt, (self.belt_speed, 0.0, 0.0))
 
     def place(self, placed: Sequence[tuple[Pose, Twist]]) -> None:
         """Set poses and velocities of the objects, and clear their old contacts."""
+        # After a time step, belts are ahead by its motion. Contacts at their ends would be others.
+        self._place_belts()
         # Old contacts would warm-start the solver. Detection with distant objects removes them.
         for far, body in enumerate(self.bodies):
             self._client.resetBasePositionAndOrientation(body, (far, 0.0, 5.0), UPRIGHT)
