@@ -17,6 +17,7 @@ from paths import ROOT
 from registries import registries_put_back
 from trainings import quiet
 
+from tpm_gym.errors import ConfigurationError
 from tpm_gym.learning.configuration import EnvOptions
 from tpm_gym.learning.datasets import KINDS, CollectConfig, Dataset, _complete, collect, digest
 from tpm_gym.learning.environments import make_envs
@@ -174,6 +175,15 @@ def test_datasets_of_two_engines_have_two_names(engine):
 def test_what_cannot_be_collected_is_refused(tmp_path, message, changes):
     with pytest.raises(ConfigError, match=message):
         collect(replace(config(tmp_path, "random"), **changes), quiet())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_that_one_of_the_ids_refuses_are_refused_before_a_dataset_is_written(tmp_path):
+    given = config(tmp_path, "random", episodes=1)
+    options = EnvOptions(engine="analytic", machine="delta")
+    given = replace(given, env=(REACH, "TPMCrossing-v0"), env_options=options)
+    with pytest.raises(ConfigurationError, match=r"'delta' is not .*\(in TPMCrossing-v0\)"):
+        collect(given, quiet())
     assert list(tmp_path.iterdir()) == []
 
 

@@ -133,6 +133,12 @@ def test_values_that_are_not_finite_raise(name, value):
         run_episodes(env, Idle(), 1, first_seed=3)
 
 
+def test_a_return_that_overflows_raises():
+    env = Scripted([scripted_step() | {"reward": 1.7e308}] * 2)
+    with pytest.raises(RolloutError, match=r"seed 3: its return overflows; .* penalty_weight"):
+        run_episodes(env, Idle(), 1, first_seed=3)
+
+
 @pytest.mark.parametrize("spec", ["random", "expert", PICK])
 def test_batches_give_the_records_of_single_environments(spec):
     """More episodes than environments; returns only to the rounding of the network's batches."""

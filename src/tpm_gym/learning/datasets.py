@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 import tpm_gym
-from tpm_gym.errors import TPMError, brief
+from tpm_gym.errors import ConfigurationError, TPMError, brief
 from tpm_gym.learning import provenance
 from tpm_gym.learning.configuration import (
     UNSET,
@@ -168,6 +168,8 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     for dataset in todo:
         if dataset.kind == "replay":
             _ = dataset.training  # raises before anything is written
+    for env in envs:
+        _require_possible(env, config.env_options)
     for dataset in todo:
         _require_free(dataset)
     scores: dict[str, tuple[float, float]] = {}
@@ -251,6 +253,14 @@ def _require_recoverable(env: str, options: EnvOptions) -> None:
                 f"--env {env}: a dataset cannot store its {name}, {shown!r}, so the environment "
                 f"could not be recovered; {way}"
             )
+
+
+def _require_possible(env: str, options: EnvOptions) -> None:
+    """Refuse options that an environment refuses, before datasets of others are written."""
+    try:
+        _kind(_stored(env, options))
+    except ConfigurationError as error:
+        raise replace(error, valid=f"{error.valid} (in {env})") from error
 
 
 def _kind(spec: EnvSpec) -> Any:

@@ -205,11 +205,18 @@ def _record(seed: int, steps: Mapping[str, NDArray[Any]], events: Sequence[str])
     conditioning, successes = steps["conditioning"].tolist(), steps["is_success"].tolist()
     torques: list[float] = steps["torque"].ravel().tolist()
     length = len(successes)
+    try:
+        total = math.fsum(steps["reward"].tolist())
+    except OverflowError as error:
+        raise RolloutError(
+            f"episode with seed {seed}: its return overflows; give smaller rewards, or a smaller "
+            "penalty_weight"
+        ) from error
     return Episode(
         seed=seed,
         success_at_end=successes[-1],
         success_once=any(successes),
-        total_reward=math.fsum(steps["reward"].tolist()),
+        total_reward=total,
         conditioning_min=min(conditioning),
         conditioning_mean=math.fsum(conditioning) / length,
         closure_error_max=float(steps["closure_error"].max()),
