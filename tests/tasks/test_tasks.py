@@ -247,6 +247,7 @@ HOME = PAPER_TPM.mount.to_world(PAPER_TPM.home)
         ({"other": None}, r"sample\(\) = \['object', 'goal'\] .*object, other, goal"),
         ({"obj": np.zeros((2, 3))}, r"sample\(\) = .*'obj'"),
         ({"goal": np.zeros((2, 3))}, r"sample\(\)\['goal'\] = (?s:.*)shape \(2, 6\)"),
+        ({"goal": np.full((2, 6), 30.0)}, r"sample\(\)\['goal'\] = .*within 2 m .* in m"),
         ({"goal": np.zeros(6)}, r"sample\(\)\['goal'\] = (?s:.*)shape \(2, 6\)"),
         ({"object": np.full((2, 3), np.nan)}, r"sample\(\)\['object'\] = (?s:.*)finite"),
         ({"other": np.array([(0.01, -0.03, 0.015)] * 2)}, r"\['object'\] = .*clear of other"),
@@ -278,6 +279,13 @@ def test_a_sample_that_ignores_what_is_chosen_is_refused():
 # -- checked when an environment is made -----------------------------------------------------------
 
 
+@pytest.mark.parametrize("limits", [(1.0, 2.0), ((0, 1, 1), (1, 1, 1)), ((1, 1, np.nan),) * 2])
+def test_accelerations_that_limit_nothing_sensible_are_refused(limits):
+    wrong = type("Wrong", (Reach,), {"accelerations": limits})
+    with pytest.raises(ConfigurationError, match="accelerations = "):
+        TPMEnv(wrong)
+
+
 @pytest.mark.parametrize(
     ("method", "value", "blamed"),
     [
@@ -290,6 +298,11 @@ def test_a_sample_that_ignores_what_is_chosen_is_refused():
         ("shaping", lambda task, state: {"singularity": state.held * 0.0}, "shaping()"),
         ("shaping", lambda task, state: {"v": np.linalg.norm(state.fk_velocity)}, "shaping()['v']"),
         ("shaping", lambda task, state: {"v": state.fk_velocity}, "shaping()['v']"),
+        ("shaping", lambda task, state: {"_goal": state.held * 0.0}, "shaping()"),
+        ("shaping", lambda task, state: {3: state.held * 0.0}, "shaping()"),
+        ("departures", lambda task, goals: goals, "departures()"),  # of the world, not the machine
+        ("departures", lambda task, goals: np.zeros(3), "departures()"),
+        ("departures", lambda task, goals: goals * np.nan, "departures()"),
         ("shaping", lambda task, state: {"v": state.torque.max() - state.torque[:, 0]},
          "shaping()['v']"),
     ],

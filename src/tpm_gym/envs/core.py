@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, IntArray, numbers
+from tpm_gym.arrays import FloatArray, IntArray, finite, numbers
 from tpm_gym.envs.rendering import Pixels, Rendering
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.mechanism.machine import Machine
@@ -21,7 +21,7 @@ from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks import checking
 from tpm_gym.tasks.control import Follower, make_control
 from tpm_gym.tasks.registry import make_task
-from tpm_gym.tasks.task import Task
+from tpm_gym.tasks.task import GOAL_BOUND, Task
 
 if TYPE_CHECKING:
     from tpm_gym.envs.shield import BrakingShield, Shield
@@ -36,7 +36,6 @@ __all__ = [
 ]
 
 OBSERVATION_BOUND = 10.0
-GOAL_BOUND = 2.0
 
 INFO: Final = {
     "is_success": bool,
@@ -179,6 +178,9 @@ class Core:
     def _make_follower(self) -> Follower | None:
         if self.task.accelerations is None:
             return None
+        limits = finite("accelerations", self.task.accelerations, (2, 3), ConfigurationError)
+        if not (limits > 0).all():
+            raise ConfigurationError("accelerations", limits.tolist(), "positive numbers, m/s^2")
         return Follower(self.machine, *self.task.accelerations, self.task.control_period)
 
     def _start(self) -> Simulation:

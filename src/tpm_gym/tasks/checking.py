@@ -90,6 +90,8 @@ def _check_shapes(task: Task, state: State) -> None:
     for name, values in shaping.items():
         if name in ("goal", "singularity"):
             raise ConfigurationError("shaping()", name, "names other than goal, singularity")
+        if not isinstance(name, str) or name.startswith("_"):  # infos have a mask _name
+            raise ConfigurationError("shaping()", name, "names that do not begin with _")
         finite(f"shaping()[{name!r}]", values, (_EXAMPLES,), ConfigurationError)
         if not isinstance(values, np.ndarray):
             raise ConfigurationError(f"shaping()[{name!r}]", type(values), "an array (n,)")

@@ -32,6 +32,9 @@ __all__ = ["Entry", "Task", "dense"]
 
 Values = tuple[float, ...]
 
+GOAL_BOUND = 2.0
+"""Largest coordinate of a goal in observations, m; larger ones would be clipped."""
+
 _ZERO = (0.0, 0.0, 0.0)
 _LIP = np.array(CUP.lip)
 
@@ -295,7 +298,7 @@ class Task(ABC):
             ResetOptionError: If an option is unknown, is not a finite array of the right shape, or
                 would put an object into another object or into the robot.
             UnreachableError: If the robot cannot get to an object or the goal.
-            ConfigurationError: If the result of :meth:`sample` is wrong.
+            ConfigurationError: If the result of :meth:`sample` or :meth:`departures` is wrong.
         """
         chosen = {} if options is None else self._chosen(options)
         given = {name: np.tile(value, (len(rngs), 1)) for name, value in chosen.items()}
@@ -310,7 +313,22 @@ class Task(ABC):
                 valid = f"chosen[{name!r}], {given[name][0].tolist()}, as the user chose it"
                 raise ConfigurationError(label, starts[name][0].tolist(), valid)
         self._check_free(starts, chosen)
+        self._check_goals(starts["goal"])
         return starts
+
+    def _check_goals(self, goals: FloatArray) -> None:
+        """Raise if goals are farther than :data:`GOAL_BOUND`, or if P cannot depart as they say."""
+        far = np.abs(goals).max(axis=1) > GOAL_BOUND
+        if far.any():
+            valid = f"within {GOAL_BOUND:g} m of the origin along each axis, world frame, in m"
+            raise ConfigurationError("sample()['goal']", goals[far][0].tolist(), valid)
+        if (departures := self.departures(goals)) is not None:
+            region = self.machine.region
+            points = finite("departures()", departures, (len(goals), 3), ConfigurationError)
+            outside = (np.minimum(points - region.low, region.high - points) < -1e-6).any(axis=1)
+            if outside.any():
+                valid = f"in the machine's frame, inside its region, {region}"
+                raise ConfigurationError("departures()", points[outside][0].tolist(), valid)
 
     @property
     def _sizes(self) -> dict[str, int]:
