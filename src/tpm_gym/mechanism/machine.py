@@ -89,7 +89,9 @@ class Machine(ABC):
         goal_region: Box of positions of P for goals, and for objects on the table. Positions with
             a conditioning below ``safe_conditioning`` are not sampled.
         home: Position of P at the start of an episode, machine's frame, m.
-        step_limit: Largest change of the command for P along x, y, z in 40 ms, m.
+        step_limit: Largest change of the command for P along x, y, z in 40 ms, m. If a reversal at
+            this speed needs more than the motors' peak torques (``State.torque`` shows them), P
+            leaves its path, and no shield can prevent this.
         joint_limit: Largest change of a joint's command in 40 ms, rad (m for a slide).
         safe_conditioning: Smallest conditioning 1/cond(J) that counts as safe from singularities;
             the penalty of the reward begins below it.
