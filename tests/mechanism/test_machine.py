@@ -298,6 +298,8 @@ def test_machines_are_found_by_name():
     register_machine("larger", lambda: made.append(scaled(1.1)) or made[-1])
     assert not made  # until it is asked for
     assert find_machine("larger") is made[-1]
+    assert find_machine("larger") is made[0]  # it is called once
+    assert len(made) == 1
     with pytest.raises(ConfigurationError, match="paper"):
         register_machine("wide", PAPER_TPM)
     register_machine("wide", WIDE_TPM)

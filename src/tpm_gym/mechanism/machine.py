@@ -427,6 +427,7 @@ class Machine(ABC):
 
 
 _MACHINES: dict[str, Machine | Callable[[], Machine]] = {}
+_MADE: dict[str, tuple[Any, Machine]] = {}  # callables of registered machines, and their results
 
 
 def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> None:
@@ -457,8 +458,12 @@ def find_machine(machine: Any) -> Machine:
         ConfigurationError: If no machine has this name, or the value is no machine.
     """
     found = _MACHINES.get(machine) if isinstance(machine, str) else machine
-    if isinstance(machine, str) and callable(found):
-        found = found()
+    if isinstance(machine, str) and callable(make := found):
+        maker, found = _MADE.get(machine, (None, None))
+        if maker is not make:
+            found = make()
+            if isinstance(found, Machine):
+                _MADE[machine] = make, found
     if not isinstance(found, Machine):
         valid = f"{', '.join(map(repr, _MACHINES))}, or a tpm_gym.Machine"
         if isinstance(machine, Geometry):
