@@ -37,6 +37,7 @@ from tpm_gym.tasks.task import Task
 __all__ = ["TPMVectorEnv"]
 
 _MOST = 10**6  # largest number of environments; those of pick-and-place take some 10 GB
+_FEWEST = 1024  # smallest number of environments for each of several threads
 
 Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
@@ -56,7 +57,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         engine: See :class:`~tpm_gym.TPMEnv`. ``"analytic"`` computes all environments together.
             With other engines, each environment has its own engine, and the environments are
             stepped one after another.
-        num_threads: Threads that step the environments of the analytic engine.
+        num_threads: Largest number of threads that step the environments of the analytic engine.
+            Each thread steps at least 1,024 environments: with fewer, one thread is faster.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         autoreset_mode: Time of the reset after the end of an episode: ``NEXT_STEP``, ``SAME_STEP``
             (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (the user calls
@@ -121,7 +123,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise
         ends = np.cumsum([part.core.count for part in self._parts]).tolist()
         self._slices = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
-        self._threads = int(num_threads)
+        self._threads = len(self._parts) if at_most is None else 1
         self._pool = self._make_pool()
         first = self._parts[0].core
         self.metadata["render_fps"] = round(1 / first.task.control_period)
@@ -500,10 +502,10 @@ class _Part:
 def _sizes(count: int, most: int | None, threads: int) -> list[int]:
     """Divide ``count`` environments into parts, and return the sizes of the parts.
 
-    ``most`` is the largest size of a part. If it is None, there are as many parts as ``threads``,
-    but at most ``count``.
+    ``most`` is the largest size of a part. If it is None, each of the ``threads`` has a part, but
+    there are so few parts that each has enough environments for a thread.
     """
-    parts = min(threads, count) if most is None else -(-count // most)
+    parts = min(threads, max(count // _FEWEST, 1)) if most is None else -(-count // most)
     return [count // parts + (k < count % parts) for k in range(parts)]
 
 
