@@ -91,12 +91,12 @@ def learning_curves(runs: Frame) -> Figure:
 
 
 def penalty(runs: Frame) -> Figure:
-    """Draw success and time with unsafe conditioning, by penalty weight; a dot is a seed."""
+    """Draw success and steps with unsafe conditioning, by penalty weight; a dot is a seed."""
     ids = sorted(runs["env"].unique())
     figure, panels = _grid(ids, "Goals that tempt towards the singularity", 2.4)
     metrics = (
         ("success_at_end", "success, bar at the median", "median", BLUE),
-        ("unsafe_share", "time with unsafe conditioning, bar at the mean", "mean", VERMILLION),
+        ("unsafe_share", "steps with unsafe conditioning, bar at the mean", "mean", VERMILLION),
     )
     for env, axes in zip(ids, panels, strict=True):
         found = groups(runs[runs["env"] == env])

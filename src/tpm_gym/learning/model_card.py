@@ -16,7 +16,7 @@ _WAY = "`tpm-gym evaluate --policy POLICY --json FILE`, with one policy"
 _ROWS = {
     "success_at_end": "success at the end",
     "return": "return",
-    "unsafe_share": "fraction of the time with unsafe conditioning",
+    "unsafe_share": "fraction of steps with unsafe conditioning",
     "torque_rms": "torque, RMS, N m",
 }
 
