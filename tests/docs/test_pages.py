@@ -165,4 +165,4 @@ def test_readme_is_short():
     text = read(ROOT / "README.md")
     assert text.count("![") == 1
     assert [len(block.splitlines()) for block in blocks(ROOT / "README.md", "bash")] == [2]
-    assert Path(DOCS / "images" / "pick_and_place.png").exists()
+    assert Path(DOCS / "images" / "pick_and_place.gif").exists()
