@@ -9,8 +9,6 @@ joints. With the two files alone, Pinocchio closes the loops:
 base hangs upside down over a table, so objects fall along +z.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Forward dynamics with semi-implicit time steps: joint velocities first, then joint positions."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

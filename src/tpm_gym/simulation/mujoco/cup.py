@@ -1,7 +1,5 @@
 """Vacuum cup in MuJoCo: a weld holds an object until the vacuum law releases it."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 
