@@ -112,7 +112,6 @@ def reachable_set(
 
     Args:
         branch: Working mode.
-        geometry: Lengths.
         shape: Numbers of cells along x, y, z: at least 2 each, and even along y. The grid holds
             every point that the rods reach.
         limits: For example :func:`~tpm_gym.analysis.limits.within_stops`.

@@ -411,8 +411,7 @@ class Machine(ABC):
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
         """Compute boxes around platform and tool: low and high corners, m, world.
 
-        Args:
-            position: Point P (3,) m, machine's frame.
+        ``position`` is point P (3,) m, machine's frame.
         """
         a, b, c = self.require_inverse(vector("position", position)).tolist()
         places = self.mechanism.places(self.joint_positions((a, b, c)))

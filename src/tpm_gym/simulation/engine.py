@@ -155,7 +155,7 @@ class Path:
     positions would move P away from its path by centimetres.
 
     Args:
-        machine: Nominal machine, used for the inverse kinematics.
+        machine: Nominal machine.
         commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
         weights: (K, 3), from :func:`spline_weights`, for the K time steps of the control period.
         bias: (n, 3) rad, encoder reading minus true joint position; None for zero.

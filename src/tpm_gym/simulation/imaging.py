@@ -94,11 +94,7 @@ class Camera:
         return eye
 
     def following(self, point_p: FloatArray) -> Camera:
-        """Return the camera with its target in the world frame.
-
-        Args:
-            point_p: (3,) m, place of point P, to which the target may be relative.
-        """
+        """Return the camera with its target in the world frame; ``point_p`` is point P (3,) m."""
         if not self.follows:
             return self
         return replace(self, target=tuple((self.target + point_p).tolist()), follows=False)
@@ -188,12 +184,9 @@ def metres(share: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
-    """Paint soft shadows onto the table, straight below bodies.
+    """Paint soft shadows onto the table, straight below bodies, if the picture has a depth.
 
-    Args:
-        picture: Picture with a depth; its colours are changed.
-        view: View of the picture.
-        casters: (k, 4) m: x, y, z (world) and radius of each body.
+    ``casters`` (k, 4) m has x, y, z (world) and radius of each body.
     """
     if picture.depth is None:
         return
@@ -215,11 +208,7 @@ def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
 def paint_markers(picture: Picture, view: View, centres: ArrayLike, radius: float) -> None:
     """Paint goal markers into a picture: translucent spheres that shine through bodies.
 
-    Args:
-        picture: Picture with a depth; its colours are changed.
-        view: View of the picture.
-        centres: (k, 3) m, world.
-        radius: Radius of the spheres, m.
+    ``centres`` (k, 3) and ``radius`` of the spheres are in m, world.
     """
     camera = view.camera
     for centre in np.reshape(centres, (-1, 3)):
@@ -285,10 +274,8 @@ def _rays(view: View, rows: slice, columns: slice) -> tuple[NDArray[Any], NDArra
 def tile(frames: Sequence[NDArray[Any]], columns: int | None = None) -> NDArray[Any]:
     """Put k images of equal shape (height, width, ...) into one image, row by row.
 
-    Args:
-        frames: Images.
-        columns: Number of images in a row; None for about as many columns as rows. Empty places
-            are filled with 0.
+    ``columns`` is the number of images in a row; None for about as many columns as rows. Empty
+    places are filled with 0.
     """
     columns = columns or math.ceil(math.sqrt(len(frames)))
     rows = -(-len(frames) // columns)

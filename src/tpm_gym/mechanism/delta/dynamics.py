@@ -113,13 +113,7 @@ def gather(pose: Pose, force: Triple) -> Triple:
 
 
 def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
-    """Compute the upper triangle of M, by rows, from the bodies' kinetic energy.
-
-    Args:
-        pose: Configuration.
-        j: Rows of the velocity Jacobian.
-        m: Constants of the bodies.
-    """
+    """Compute the upper triangle of M, by rows, from the kinetic energy and the rows ``j`` of J."""
     one, two, three = legs(pose, m)
     (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = j
     a, b, c = (xa, ya, za), (xb, yb, zb), (xc, yc, zc)  # velocities of P for unit rates

@@ -129,10 +129,7 @@ def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Iner
 def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
     """Compute the upper triangle of M, by rows, from the bodies' kinetic energy.
 
-    Args:
-        pose: Configuration.
-        j: Rows of the velocity Jacobian; motor 3 moves neither C1 nor the height of P.
-        m: Constants of the bodies.
+    ``j`` has the rows of the Jacobian. Motor 3 moves neither C1 nor the height of P.
     """
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (r1x, r1y, r1z), (_, _, r2z), (r3x, r3y, r3z) = pose.rods
@@ -238,13 +235,7 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
 
 
 def gather(pose: Pose, at_c: _Pair, at_p: Triple) -> Triple:
-    """Compute the motor torques (N m) that exert a force at C1 and a force at P.
-
-    Args:
-        pose: Configuration.
-        at_c: Force at C1 along x and z, N.
-        at_p: Force at P, N.
-    """
+    """Compute the motor torques (N m) that exert a force at C1 (N, x and z) and at P (N)."""
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
     rod3 = (f.cos_beta * py - f.sin_beta * px) * pose.per_k  # its force, over l4

@@ -116,13 +116,8 @@ def collide_objects(
 ) -> int:
     """Add contacts of objects with each other and with the table; return the number of contacts.
 
-    Args:
-        objects: (k,) objects.
-        held: Index of the held object; -1 for none.
-        setting: Constants of the simulation.
-        polygons: (2, 12, 3) m, scratch memory.
-        contacts: Output.
-        count: Number of contacts at the call.
+    ``held`` is the index of the held object; -1 for none. ``polygons`` is scratch memory, and
+    ``count`` is the number of contacts at the call.
     """
     slot = len(objects) * (TABLE_SLOTS + LIP_SLOTS)
     for j in range(len(objects)):
@@ -176,13 +171,8 @@ def collide_lip(
 ) -> int:
     """Find contacts of the lip with all objects except the held object; return their number.
 
-    Args:
-        objects: (k,) objects.
-        held: Index of the held object; -1 for none.
-        lip: Centre of the lip, m, world.
-        near: Largest gap of a contact, m.
-        setting: Constants of the simulation.
-        contacts: Output.
+    ``held`` is the index of the held object; -1 for none. ``lip`` is the centre of the lip (m,
+    world), and ``near`` is the largest gap of a contact, m.
     """
     count = 0
     for i in range(len(objects)):

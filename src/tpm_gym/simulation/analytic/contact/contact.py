@@ -54,7 +54,7 @@ class Contact:
         count: Number of tables, n.
         time_step: Time step, s.
         table: Half edge lengths of the tables along x and y, m.
-        frame: Factors and origin (m) that convert the machine's frame to the world frame.
+        frame: Factors and origin (m) of :attr:`.Mount.frame`.
         belt: Belt of each table; None for none.
     """
 
