@@ -22,12 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, first_row, numbers, points, vector
-from tpm_gym.errors import (
-    ConfigurationError,
-    JointLimitError,
-    SingularityError,
-    UnreachableError,
-)
+from tpm_gym.errors import ConfigurationError, JointLimitError, SingularityError, UnreachableError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work

@@ -153,7 +153,7 @@ class ServoDrives:
         """Initialise the drives with nominal plants, at rest at home."""
         from tpm_gym.simulation import compiled  # imports Numba
 
-        self._step_law, self._braced = compiled.servo_torques, compiled.braced_inverse
+        self._loops = compiled
         if machine.mirror_axis is not None:
             valid = f"'ideal': {machine.name!r} passes a plane in which the inertia is infinite"
             raise ConfigurationError("drive", servo, valid)
@@ -201,17 +201,15 @@ class ServoDrives:
         The feed-forward is computed for the first and the last time step and interpolated linearly,
         because it is almost linear within a control period.
         """
-        from tpm_gym.simulation import compiled  # imports Numba
-
         theta = path.readings()
         steps = theta.shape[1] - 1
         references = References(*np.empty((3, steps, len(theta), 3)))
         torques = np.zeros((2, len(theta), 3))
         if self._servo.feedforward != "none":
-            there, rates, changes = compiled.ends(theta, self._step)
+            there, rates, changes = self._loops.ends(theta, self._step)
             moving = float(self._servo.feedforward == "computed")
             torques = path.machine.torque(there, moving * rates, moving * changes)
-        compiled.along(theta, path.true(theta), torques, self._step, references)
+        self._loops.along(theta, path.true(theta), torques, self._step, references)
         return references
 
     def begin(self, theta: FloatArray) -> None:
@@ -225,7 +223,7 @@ class ServoDrives:
             mass[lost] = self._machine.motion(home, 0.0 * home, built).mass
         mass *= self._lightest
         stiffness, damping = self._stiffness, self._servo.damping
-        inverse = self._braced(mass, stiffness, damping, self._step)
+        inverse = self._loops.braced_inverse(mass, stiffness, damping, self._step)
         self.law = stiffness, damping, mass, inverse, self._effort, self._line
 
     def torque(
@@ -236,6 +234,7 @@ class ServoDrives:
         ``index`` is the index of the time step in the control period. ``theta`` (n, 3) rad and
         ``theta_dot`` (n, 3) rad/s are joint positions and velocities at its beginning.
         """
-        self._step_law(index, references, self.law, theta, theta_dot, self._step, self.memory)
+        step, memory = self._step, self.memory
+        self._loops.servo_torques(index, references, self.law, theta, theta_dot, step, memory)
         torque: FloatArray = self.memory[0]
         return torque

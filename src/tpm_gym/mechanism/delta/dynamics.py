@@ -39,12 +39,7 @@ from tpm_gym.mechanism.delta.equations import (
     resolve,
     velocity,
 )
-from tpm_gym.mechanism.delta.geometry import (
-    IRB_360,
-    DeltaGeometry,
-    require_delta,
-    require_side,
-)
+from tpm_gym.mechanism.delta.geometry import IRB_360, DeltaGeometry, require_delta, require_side
 from tpm_gym.mechanism.delta.kinematics import no_assembly
 from tpm_gym.mechanism.equation_of_motion import EquationOfMotion, Formulas
 from tpm_gym.mechanism.inertia import Swing, swing_force

@@ -47,13 +47,13 @@ class IdealSteps:
 
     def __init__(self, references: FloatArray, effort: FloatArray, step: float) -> None:
         """Store the arguments; no motor has been at its limit yet."""
-        self._references, self._effort, self._step = references, effort, step
+        self._references, self._effort, self.step = references, effort, step
         self._behind = np.zeros((2, len(effort)), dtype=np.bool_)
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
         """Compute a time step; arguments as in :func:`ideal_step`."""
         ideal_step(
-            index, self._references, self._effort, course[:-1], at, self._step, new, self._behind
+            index, self._references, self._effort, course[:-1], at, self.step, new, self._behind
         )
 
     def push(
@@ -61,7 +61,7 @@ class IdealSteps:
     ) -> FloatArray:
         """Find the torques (r, 3) N m of a time step; arguments as in :func:`ideal_push`."""
         torque = np.empty_like(theta)
-        references, effort, step = self._references, self._effort, self._step
+        references, effort, step = self._references, self._effort, self.step
         ideal_push(index, references, effort, theta, rates, inverse, step, torque, self._behind)
         return torque
 
@@ -104,7 +104,6 @@ def march(
     steps: IdealSteps | ServoSteps,
     count: int,
     course: Course,
-    step: float,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
     """Compute ``count`` time steps of r robots by forward dynamics.
@@ -117,7 +116,6 @@ def march(
         steps: Drives of the robots.
         count: Number of time steps, K.
         course: State of the robots at the beginning.
-        step: Time step, s.
         touch: Function that moves objects and cups.
 
     Returns:

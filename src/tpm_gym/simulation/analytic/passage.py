@@ -79,14 +79,13 @@ def pass_through(
     steps: IdealSteps,
     count: int,
     course: Course,
-    step: float,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
     """Compute ``count`` time steps of r robots with ideal drives.
 
     Arguments and results are explained in :func:`.forward_dynamics.march`.
     """
-    torques = np.empty((count, *course.theta.shape))
+    torques, step = np.empty((count, *course.theta.shape)), steps.step
     speed = (course.position - course.before) / step
     for index in range(count):
         # K in the middle of the time step gives accurate changes of the joint positions.

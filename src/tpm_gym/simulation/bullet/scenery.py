@@ -21,15 +21,7 @@ from tpm_gym.simulation.imaging import (
     View,
     metres,
 )
-from tpm_gym.simulation.stage import (
-    FLOOR,
-    FLOOR_EDGE,
-    LIGHT,
-    PATCH_HEIGHT,
-    Slab,
-    boards,
-    painted,
-)
+from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, PATCH_HEIGHT, Slab, boards, painted
 from tpm_gym.simulation.state import Block, Scene
 
 _SHADING = {"lightAmbientCoeff": 0.6, "lightDiffuseCoeff": 0.35, "lightSpecularCoeff": 0.05}

@@ -15,12 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
-from tpm_gym.simulation.analytic.contact.state import (
-    Route,
-    Setting,
-    tables_for,
-    work_for,
-)
+from tpm_gym.simulation.analytic.contact.state import Route, Setting, tables_for, work_for
 from tpm_gym.simulation.analytic.contact.stepping import advance, place, read
 from tpm_gym.simulation.stage import boards
 from tpm_gym.simulation.state import Belt, Block
