@@ -140,8 +140,6 @@ class _Arcs:
 
     Attributes:
         curve: Function that returns points of the curve; see :data:`Curve`.
-        geometry: First argument of ``curve``, the lengths.
-        mode: Second argument of ``curve``, the working mode.
         first: (n,) first sign of each arc, -1 or 1.
         second: (n,) second sign of each arc, -1 or 1.
         middle: (n,) rad, middle of the angle's interval.

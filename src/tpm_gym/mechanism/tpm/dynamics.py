@@ -88,13 +88,8 @@ def pose_at(
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
     """Compute the motors' torques, N m.
 
-    Args:
-        pose: Configuration.
-        rates: Joint velocities, rad/s.
-        changes: Joint accelerations, rad/s^2.
-        gravity: Acceleration of gravity, m/s^2. Subtracting it from the accelerations of all points
-            has the same effect as adding the weights.
-        m: Constants of the bodies.
+    ``rates`` (rad/s) and ``changes`` (rad/s^2) are joint velocities and accelerations. Subtracting
+    ``gravity`` (m/s^2) from the accelerations of all points has the same effect as adding weights.
     """
     turn, moved = velocities(pose, rates)
     elbows, (cx, cz), (px, py, pz) = accelerations(pose, rates, changes, turn, moved)

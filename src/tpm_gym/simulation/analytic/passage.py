@@ -81,10 +81,7 @@ def pass_through(
     course: Course,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
-    """Compute ``count`` time steps of r robots with ideal drives.
-
-    Arguments and results are explained in :func:`.forward_dynamics.march`.
-    """
+    """Compute time steps of robots with ideal drives, as :func:`.forward_dynamics.march` does."""
     torques, step = np.empty((count, *course.theta.shape)), steps.step
     speed = (course.position - course.before) / step
     for index in range(count):

@@ -24,13 +24,8 @@ from tpm_gym.simulation.state import Belt, Block
 class Reading(NamedTuple):
     """State of the k objects and the cup on each of n tables, in the world frame.
 
-    Attributes:
-        position: (n, k, 3) m, centres of the objects.
-        quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
-        velocity: (n, k, 3) m/s, velocities of the objects.
-        angular_velocity: (n, k, 3) rad/s, angular velocities of the objects.
-        held: (n,) index of the object in the cup; -1 for none.
-        vacuum: (n,) Pa below the ambient pressure.
+    The attributes are those of :class:`.Readout`, which begin with ``object_`` there if they belong
+    to objects.
     """
 
     position: FloatArray
@@ -76,13 +71,7 @@ class Contact:
         self.place(everything, middle)
 
     def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
-        """Set the objects' masses and friction coefficients on some tables.
-
-        Args:
-            rows: Indices of the r tables.
-            mass_factor: (r,) factors of the nominal masses.
-            friction_factor: (r,) factors of the nominal friction coefficients.
-        """
+        """Multiply the objects' nominal masses and friction on r tables by factors (r,) each."""
         for name, factor in (("mass", mass_factor), ("friction", friction_factor)):
             nominal = np.array([getattr(block, name) for block in self._blocks])
             self._tables.objects[name][rows] = factor[:, None] * nominal
