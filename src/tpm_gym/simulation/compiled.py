@@ -153,15 +153,10 @@ def measured(
 ) -> FloatArray:
     """Return measurements of n robots and their k objects by encoders, camera and vacuum gauge.
 
+    The first arguments are ``fk_position``, ``fk_velocity``, ``command``, ``object_position``,
+    ``object_axis``, ``object_velocity``, ``held`` and ``vacuum`` of :class:`.State`.
+
     Args:
-        position: (n, 3) m, point P.
-        velocity: (n, 3) m/s, velocity of P.
-        command: (n, 3) m, commanded P.
-        places: (n, k, 3) m, centres of the objects.
-        axes: (n, k, 3), z axes of the objects.
-        velocities: (n, k, 3) m/s.
-        held: (n,) index of the object in the cup; -1 for none.
-        vacuum: (n,) Pa.
         lip: (3,) m, vector from the lip of the cup to P.
         halves: (k,) m, half heights of the objects.
         most: Largest vacuum, Pa.

@@ -1,7 +1,5 @@
 """Dynamics of the Delta in closed form, without solver or iteration.
 
-    torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
-
 The model of the masses is exact for the bodies of :mod:`tpm_gym.mechanism.delta.bodies`:
 
 * arms turn about the motors' axes;

@@ -1,7 +1,5 @@
 """The dynamics of the mechanism in closed form, without solver or iteration.
 
-    torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
-
 The coupling degree is zero, so there are formulas for position, velocity and acceleration of every
 point. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and then of P
 from the accelerations of B_i, each by one division (:func:`_resolve`). Forces of inertia and weight

@@ -37,13 +37,7 @@ class Course(NamedTuple):
 
 
 class IdealSteps:
-    """Ideal drives with limited torques.
-
-    Args:
-        references: (K, r, 3) rad, joint positions at the ends of the time steps.
-        effort: (r, 3) N m, largest torques.
-        step: Time step, s.
-    """
+    """Ideal drives with limited torques; the arguments are explained in :func:`ideal_step`."""
 
     def __init__(self, references: FloatArray, effort: FloatArray, step: float) -> None:
         """Store the arguments; no motor has been at its limit yet."""

@@ -59,7 +59,7 @@ def advance(
         tables: State of the objects and cups of all robots; changed.
         earlier: Output: the state of the simulated robots at the beginning of the control period.
         rows: (r,) indices of the robots to simulate.
-        path: Motion of point P of these robots, in all time steps of the control period.
+        path: Motion of point P of these robots.
         on: (r,) whether the vacuum is on.
         push: (r, w, 3) N, force on the platform in each of the final w time steps of ``path``,
             machine's frame; output, initially zero.
