@@ -82,9 +82,9 @@ class Camera:
         """Unit vectors (3, 3) to the right, up and forward."""
         yaw, pitch = math.radians(self.yaw), math.radians(self.pitch)
         right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        level = np.array([-math.sin(yaw), math.cos(yaw), 0.0])
-        up, forward = np.array([0.0, 0.0, math.cos(pitch)]), np.array([0.0, 0.0, math.sin(pitch)])
-        up, forward = up - math.sin(pitch) * level, forward + math.cos(pitch) * level
+        level, vertical = np.array([-math.sin(yaw), math.cos(yaw), 0.0]), np.array([0.0, 0.0, 1.0])
+        up = math.cos(pitch) * vertical - math.sin(pitch) * level
+        forward = math.sin(pitch) * vertical + math.cos(pitch) * level
         return np.stack([right, up, forward])
 
     @property
@@ -120,8 +120,8 @@ def camera_of(value: Any, machine: Machine) -> Camera:
 
 
 def _named(name: str, machine: Machine) -> Camera:
-    corners = (machine.mount.to_world(point) for point in (machine.region.low, machine.region.high))
-    low, high = np.sort(np.stack([*corners]), axis=0)
+    region = machine.region
+    low, high = np.sort(machine.mount.to_world([region.low, region.high]), axis=0)
     low[2] = TABLE.top
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     x, y, z = middle.tolist()

@@ -160,19 +160,11 @@ def _drift(leg: _Leg, v: Triple, rate: Numbers) -> Numbers:
 def _inertial(
     at: Pair, leg: _Leg, v: Triple, a: Triple, rate: Numbers, change: Numbers, gravity: Triple
 ) -> tuple[Triple, Numbers]:
-    """Compute the force and the torque that a leg's inertia and weight require.
+    """Compute the force at P (N) and the motor's torque (N m) for a leg's inertia and weight.
 
-    Args:
-        at: Direction of the leg.
-        leg: The leg.
-        v: Velocity of P in the leg's frame, m/s.
-        a: Acceleration of P in the base's frame, m/s^2.
-        rate: Joint velocity, rad/s.
-        change: Joint acceleration, rad/s^2.
-        gravity: Gravity in the base's frame, m/s^2.
-
-    Returns:
-        The force at P in the base's frame, N, and the torque of the leg's motor, N m.
+    The velocity ``v`` of P (m/s) is in the leg's frame. The acceleration ``a`` of P, gravity (both
+    m/s^2) and the force are in the base's frame. ``rate`` (rad/s) and ``change`` (rad/s^2) are the
+    joint's velocity and acceleration.
     """
     cos, sin, (x, y, z), motor, weight, couple, swing = leg
     (ax, _, az), (gx, gy, gz) = inwards(at, a), inwards(at, gravity)

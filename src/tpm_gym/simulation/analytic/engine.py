@@ -97,7 +97,6 @@ class AnalyticEngine:
         self._exact = True  # whether bias and length errors are 0, so that P is on its spline
         self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
         self._effort = np.tile(self._nominal_effort, (count, 1))
-        self._bias = np.zeros((count, 3))
         servo, step = self._servo, self.time_step
         self._contact = Contact(
             scene.objects, count, step, machine.table, machine.mount.plain_frame, scene.belt

@@ -305,12 +305,8 @@ def _touch_face(
 def _overlap(box: _Box, first: int, second: int, foot: Vector) -> tuple[float, float]:
     """Return the lowest and highest height (m) at which the lip's side touches a side face.
 
-    Args:
-        box: Object.
-        first: Index of one of the two axes of the object that are parallel to the face.
-        second: Index of the other axis.
-        foot: Point of the lip's rim, relative to the object's centre, m; the heights are above this
-            point.
+    ``first`` and ``second`` are the object's axes that are parallel to the face. The heights are
+    above ``foot``, a point of the lip's rim relative to the object's centre, m.
     """
     low, high = 0.0, CUP.bellows
     for k in (first, second):
