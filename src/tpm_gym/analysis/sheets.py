@@ -8,8 +8,6 @@ one angle, so the nearest point of a surface is found by a search over this angl
 of arcs, one for each interval of the angle in which the curve is real.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -142,8 +140,6 @@ class _Arcs:
 
     Attributes:
         curve: Function that returns points of the curve; see :data:`Curve`.
-        geometry: First argument of ``curve``, the lengths.
-        mode: Second argument of ``curve``, the working mode.
         first: (n,) first sign of each arc, -1 or 1.
         second: (n,) second sign of each arc, -1 or 1.
         middle: (n,) rad, middle of the angle's interval.
@@ -204,7 +200,6 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
     Args:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
         mode: The working mode. Points of other working modes are included; see :data:`Point`.
-        geometry: Link lengths.
 
     Raises:
         InputError: If no curve belongs to a factor of this name.
@@ -266,8 +261,6 @@ def nearest(
         points: (n, 3) m, 0 <= y <= l7.
         limit: (n,) m, at most the distance to the planes y = 0 and |y| = l7, and to the boundary
             of leg 3's reach.
-        mode: The working mode.
-        geometry: Link lengths.
 
     Returns:
         Distance (n,) m, nearest point (n, 3) m and index of the factor (n,). If no surface is

@@ -211,8 +211,6 @@ def arm(
         out: Distance of C from the arm's plane, m.
         bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); it selects one of the two
             solutions.
-        g: Lengths.
-        ns: Namespace.
 
     Returns:
         The angle, and whether the leg reaches C.
@@ -374,11 +372,7 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
     """Return the margin by which a leg reaches C, m; negative if the leg does not reach C.
 
-    Args:
-        level: Horizontal distance of C from A in the arm's plane, m.
-        vertical: Vertical distance of C from A, m.
-        out: Distance of C from the arm's plane, m.
-        g: Lengths.
+    ``level``, ``vertical`` and ``out`` are the arguments a, b and out of :func:`arm`, m.
     """
     if abs(out) >= g.l4:
         return g.l4 - abs(out)

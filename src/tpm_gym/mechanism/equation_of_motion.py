@@ -3,8 +3,6 @@
 torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -181,13 +179,10 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Call the function ``text`` for all rows of the arrays ``states``, (..., 3) each.
+        """Return the results of ``text`` for all rows of the arrays ``states``, (..., 3) each.
 
         The first array is theta. The arguments of ``text`` are the configuration at theta, and then
         the rows of the other arrays, in the arrays' order.
-
-        Returns:
-            Results of ``text`` for all rows.
         """
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:

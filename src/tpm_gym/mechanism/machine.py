@@ -22,12 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, first_row, numbers, points, vector
-from tpm_gym.errors import (
-    ConfigurationError,
-    JointLimitError,
-    SingularityError,
-    UnreachableError,
-)
+from tpm_gym.errors import ConfigurationError, JointLimitError, SingularityError, UnreachableError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
@@ -411,8 +406,7 @@ class Machine(ABC):
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
         """Compute boxes around platform and tool: low and high corners, m, world.
 
-        Args:
-            position: Point P (3,) m, machine's frame.
+        ``position`` is point P (3,) m, machine's frame.
         """
         a, b, c = self.require_inverse(vector("position", position)).tolist()
         places = self.mechanism.places(self.joint_positions((a, b, c)))

@@ -1,7 +1,5 @@
 """Sizes and materials of the arms, rods and motors of mechanisms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final, Literal
 
@@ -105,11 +103,7 @@ def free_platform(solids: tuple[Solid, ...], reach: float) -> list[Link]:
 
     Three slides and three revolutes, with almost no mass between them, let it move freely. So every
     leg can end in loop closures, and every closure connects two branches of the tree. PyBullet's
-    direct solver needs this.
-
-    Args:
-        solids: Solids of the platform.
-        reach: Largest distance from the base's origin to P, m.
+    direct solver needs this. ``reach`` is the largest distance from the base's origin to P, m.
     """
     speck = Solid("box", (_SPECK,) * 3, LEVEL, 1.0, colour="yellow")
     links, parent = [], "base"

@@ -10,8 +10,6 @@ diagonal blocks: the second moments of the mass (3, 3), and the mass. So the tor
 trace(dF/dtheta H F''^T) over the bodies, without angular velocities.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -35,7 +33,6 @@ def torque(
     """Compute the motors' torques (3,) N m (N for a slide) for a motion.
 
     Args:
-        mechanism: Bodies.
         joint_positions: Function from the motors' positions to all joint positions.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
         link_masses: For each moving link, factor by which its mass and inertia are multiplied.

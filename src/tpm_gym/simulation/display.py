@@ -1,7 +1,5 @@
 """Check for a display. Without a display, an engine that opens a window may end the process."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

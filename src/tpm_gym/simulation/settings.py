@@ -1,7 +1,5 @@
 """Numerical settings that all engines share, and their conversion from mappings."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
@@ -15,12 +13,10 @@ _SHORTEST = 1e-6  # s; a control step with a shorter time step would take minute
 
 
 def settings_of(kind: type[T], name: str, value: Any) -> T:
-    """Return ``value`` as an instance of ``kind``.
+    """Return settings as an instance of the dataclass ``kind``.
 
-    Args:
-        kind: Dataclass of settings.
-        name: Name of the option in error messages.
-        value: An instance of ``kind``, a mapping of its fields, or None for the defaults.
+    ``value`` is such an instance, a mapping of its fields, or None for the defaults. Error messages
+    call the option ``name``.
 
     Raises:
         ConfigurationError: If ``value`` is none of these, or has an unknown field or a field that

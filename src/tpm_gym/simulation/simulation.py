@@ -4,8 +4,6 @@ The engine simulates the robots. This module adds encoder errors, records which 
 their assembly mode or working mode, and computes the State.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,13 +17,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Servo, require_servo
-from tpm_gym.simulation.engine import (
-    Engine,
-    Path,
-    loops,
-    make_engine,
-    spline_weights,
-)
+from tpm_gym.simulation.engine import Engine, Path, loops, make_engine, spline_weights
 from tpm_gym.simulation.imaging import Camera, Picture, View, paint_markers, paint_shadows
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import count_steps

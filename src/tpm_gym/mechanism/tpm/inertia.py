@@ -1,7 +1,5 @@
 """Sixteen constants of the TPM's bodies for :mod:`tpm_gym.mechanism.tpm.dynamics`."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -8,8 +8,6 @@ normal to the plane is zero. There, the motors cannot accelerate P in this direc
 its speed.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -81,14 +79,10 @@ def pass_through(
     steps: IdealSteps,
     count: int,
     course: Course,
-    step: float,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
-    """Compute ``count`` time steps of r robots with ideal drives.
-
-    Arguments and results are explained in :func:`.forward_dynamics.march`.
-    """
-    torques = np.empty((count, *course.theta.shape))
+    """Compute time steps of robots with ideal drives, as :func:`.forward_dynamics.march` does."""
+    torques, step = np.empty((count, *course.theta.shape)), steps.step
     speed = (course.position - course.before) / step
     for index in range(count):
         # K in the middle of the time step gives accurate changes of the joint positions.

@@ -1,7 +1,5 @@
 """PyBullet's functions, bound to one physics client."""
 
-from __future__ import annotations
-
 import ctypes
 import importlib.util
 import itertools
@@ -27,12 +25,8 @@ class Client:
     """Physics client: pybullet's functions with the argument ``physicsClientId`` filled in.
 
     It replaces BulletClient of pybullet_utils. It looks up each function only once, which halves
-    the time of the cheaper calls, and it prints nothing.
-
-    Args:
-        physics: Numerical settings.
-        gui: Whether to open PyBullet's window.
-        renderer: ``"tiny"`` or None draws on the CPU; ``"egl"`` draws on a GPU.
+    the time of the cheaper calls, and it prints nothing. The arguments are those of
+    :class:`.BulletEngine`.
 
     Attributes:
         number: PyBullet's id of the client.

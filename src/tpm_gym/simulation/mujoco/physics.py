@@ -1,7 +1,5 @@
 """Numerical settings of MuJoCo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from tpm_gym.arrays import is_number, is_whole

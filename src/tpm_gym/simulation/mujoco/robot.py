@@ -8,8 +8,6 @@ half of a time step (``mj_step1``) creates the friction constraints. Then this m
 target velocities. The second half (``mj_step2``) computes the forces.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 
@@ -30,8 +28,6 @@ class Robot:
     """Robot in a MuJoCo model.
 
     Args:
-        model: Compiled model.
-        data: State of the model.
         machine: Machine with the true lengths of the robot.
         ideal: Whether the motors have ideal drives; else they apply given torques.
 

@@ -1,7 +1,5 @@
 """State of objects and cups, and workspace of the contact solver."""
 
-from __future__ import annotations
-
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -89,9 +87,8 @@ class Setting(NamedTuple):
             x, and highest y (half of the width).
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
-        turn: Signs (1 or -1). The components of a vector in the machine's frame times these signs
-            are its components in the world frame.
-        origin: Origin of the machine's frame in the world frame, m.
+        turn: Factors of :attr:`.Mount.frame`.
+        origin: Origin of :attr:`.Mount.frame`, m.
     """
 
     half: FloatArray
