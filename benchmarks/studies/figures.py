@@ -8,7 +8,14 @@ from typing import Any, Final
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import (
+    EngFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    PercentFormatter,
+    StrMethodFormatter,
+)
 
 from tpm_gym.learning.figure_style import (
     BLUE,
@@ -25,7 +32,7 @@ from tpm_gym.learning.figure_style import (
 )
 from tpm_gym.simulation.randomisation import LIMITS
 
-from .bisection import UNITS, ends, nominal
+from .bisection import UNITS, ends
 from .page import ENGINES, LEARNED, Frame, groups, split, successes
 from .records import Record
 
@@ -141,9 +148,15 @@ def robustness(bisections: Sequence[Record]) -> Figure:
         axes.set_xlabel(UNITS.get(attribute, "factor, logarithmic"))
         if attribute not in UNITS:
             axes.set_xscale("log")
-        ticks = sorted([nominal(attribute), *ends(attribute)])
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.minorticks_off()
+            low, high = ends(attribute)
+            parts = (1, 2, 5) if high <= 100 * low else (1, 3)
+            axes.xaxis.set_major_locator(LogLocator(subs=parts))
+            axes.xaxis.set_minor_locator(LogLocator(subs=range(1, 10)))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        else:
+            most = 6 if max(ends(attribute)) >= 1 else 5  # small numbers have long labels
+            axes.xaxis.set_major_locator(MaxNLocator(most, steps=(1, 2, 5, 10)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     _legend(figure, "each dot is a test; success halves near the dashed lines")
     return figure
 

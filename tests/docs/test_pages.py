@@ -25,6 +25,7 @@ EVIDENCE = {
     "docs/paper.md",  # every equation of the paper
     "docs/loops-sweep.md",  # a table
     "docs/results-runs.md",  # tables
+    "docs/task-sheets.md",  # tables
 }
 FILLED = [
     ("README.md", "numbers", "readme_numbers"),

@@ -212,6 +212,7 @@ class Core:
         before = [rng.bit_generator.state for rng in rngs] if options is not None else []
         try:
             starts = self.task.start(rngs, options)
+            _require_in_space(starts["goal"])
         except BaseException:
             for rng, state in zip(rngs, before, strict=False):
                 rng.bit_generator.state = state
@@ -478,6 +479,14 @@ def action_space(task: Task) -> spaces.Box:
 
 def _box(bound: float, length: int) -> spaces.Box:
     return spaces.Box(-bound, bound, (length,), np.float32)
+
+
+def _require_in_space(goals: FloatArray) -> None:
+    """Refuse goals (r, goal_size) m out of the observation space, which P cannot achieve."""
+    beyond = np.abs(goals).max(axis=1) > GOAL_BOUND
+    if beyond.any():
+        valid = f"coordinates from -{GOAL_BOUND:g} to {GOAL_BOUND:g} m, as the observation space"
+        raise ConfigurationError("sample()['goal']", goals[beyond][0].tolist(), valid)
 
 
 def _goal_free(terms: Mapping[str, Any]) -> Any:

@@ -43,8 +43,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Ids
 
-    ``TPM<task>{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense reward. The
-    classes of :mod:`tpm_gym.tasks` explain the tasks.
+    ``TPM<task>{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense goal term.
+    The classes of :mod:`tpm_gym.tasks` explain the tasks.
 
     | task | action | observation | goal | steps | what to do |
     | --- | --- | --- | --- | --- | --- |
@@ -113,8 +113,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Reward
 
-    ``goal`` term + ``singularity`` term (+ in dense rewards ``approach`` where there are objects,
-    or ``gate`` in Cycle).
+    ``goal`` term + ``singularity`` term (+ ``gate`` in Cycle, in sparse rewards too; + in dense
+    rewards ``approach`` where there are objects).
 
     | term | value |
     | --- | --- |

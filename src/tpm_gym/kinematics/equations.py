@@ -340,7 +340,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
         cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
         _, _, found = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
     free, y1, distance2, level, vertical = map(float, found)
-    hint = f"choose joint angles within reach (branch {branch})"
+    hint = f"choose joint angles at which {branch} exists"
     if free:
         return UnreachableError(theta, "loop 2 (beta is free: a2 = b2 = 0)", 0.0, hint)
     if abs(y1) >= g.l4:
@@ -356,7 +356,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
 
 def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableError:
     """Explain which leg does not reach a point (3,) m in a working mode, and by how much."""
-    hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
+    hint = f"choose a point that {branch} reaches (tpm_gym.kinematics.workspace)"
     beyond = g.l7 - abs(point[1])
     if beyond < 0:
         return UnreachableError(point, "beta (|y| <= l7)", beyond, hint)

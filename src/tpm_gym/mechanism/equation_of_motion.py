@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, first_row, numbers, vector
+from tpm_gym.arrays import FloatArray, Vector, explained, finite, finite_points, numbers, vector
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
@@ -193,7 +193,7 @@ class EquationOfMotion(ABC):
         table = _side_by_side(states)
         missing, *found = by_rows(results, table)
         if missing.any():
-            raise self._refusal(first_row(table[..., :3], missing != 0))
+            raise explained(self._refusal, table[..., :3], missing != 0)
         return found
 
 

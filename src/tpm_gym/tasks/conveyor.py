@@ -130,7 +130,7 @@ class Conveyor(Task):
         return (*super().observed(), speed)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only."""
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), self.top(state)))}

@@ -187,7 +187,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the base class's term, minus min(gap / 10 mm, 1) if the reward is dense."""
+        """Return -gap / 0.1 m - min(gap / 10 mm, 1) if dense; if sparse, the base class's term."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 

@@ -34,7 +34,13 @@ SLOW_SPEED = 0.025
 
 
 def hanging(block: Block) -> FloatArray:
-    """Return the vector (3,) m from the centre of a block in the cup to point P."""
+    """Return the vector (3,) m from the centre of a block in the cup to point P.
+
+    Raises:
+        ConfigurationError: If ``block`` is no Block, such as a name.
+    """
+    if not isinstance(block, Block):
+        raise ConfigurationError("block", block, "a tpm_gym.simulation.Block, not its name")
     return np.array([0.0, 0.0, block.height / 2 + CUP.length])
 
 
@@ -188,7 +194,7 @@ class Motion:
 
     def _above(self, block: Block, clearance: float) -> FloatArray:
         """Return P (3,) m, machine's frame, at which the lip is ``clearance`` m above a block."""
-        place = self._see(block.name, "position") + hanging(block)
+        place = hanging(block) + self._see(block.name, "position")
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:

@@ -65,7 +65,7 @@ class PickAndPlace(Task):
         return {"object": [table], "goal": [table, air]}
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only."""
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), self.top(state)))}

@@ -114,7 +114,7 @@ class Push(Task):
         return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only."""
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), state.object_position[:, 0]))}

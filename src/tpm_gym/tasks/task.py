@@ -70,8 +70,8 @@ class Task(ABC):
 
     Args:
         machine: Machine that performs the task.
-        reward: ``"sparse"`` (0 where the goal is achieved, else -1) or ``"dense"`` (minus the
-            distance in units of 0.1 m).
+        reward: Goal term: ``"sparse"`` (0 where the goal is achieved, else -1) or ``"dense"``
+            (minus the distance in units of 0.1 m). The terms of :meth:`shaping` are added to both.
         goals: Name of the sampling of goals and starts, one of :attr:`samplings`.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
 
@@ -186,8 +186,8 @@ class Task(ABC):
                 result contains them unchanged, and sampled positions keep clear of them.
 
         Returns:
-            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. With a
-            belt, also ``"belt_speed"`` (r, 1) m/s.
+            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m, from
+            -2 to 2 m, as the observation space. With a belt, also ``"belt_speed"`` (r, 1) m/s.
         """
 
     def achieved(self, state: State) -> FloatArray:
