@@ -26,15 +26,6 @@ from tpm_gym.tasks.task import Task
 if TYPE_CHECKING:
     from tpm_gym.envs.shield import BrakingShield, Shield
 
-__all__ = [
-    "Core",
-    "EnvSnapshot",
-    "Observation",
-    "action_space",
-    "compute_reward",
-    "seed_of",
-]
-
 OBSERVATION_BOUND = 10.0
 GOAL_BOUND = 2.0
 

@@ -16,8 +16,6 @@ from tpm_gym.simulation.imaging import View, camera_of
 from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.tasks.task import Task
 
-__all__ = ["RENDER_MODES", "Pixels", "Rendering"]
-
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple", "segmentation")
 """Values of ``render_mode``."""
 

@@ -33,8 +33,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
 from tpm_gym.tasks.control import Control, Follower
 
-__all__ = ["BrakingShield", "Shield", "make_shield"]
-
 MARGIN = 0.15
 """Extra conditioning that shields keep with servo drives or randomised plants, as a fraction of the
 machine's ``safe_conditioning``."""

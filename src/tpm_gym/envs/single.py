@@ -31,8 +31,6 @@ from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TPMEnv"]
-
 Action = NDArray[Any]
 
 _ROW = np.array([0])

@@ -34,8 +34,6 @@ from tpm_gym.simulation.imaging import tile
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TPMVectorEnv"]
-
 _MOST = 10**6  # largest number of environments; those of pick-and-place take some 10 GB
 _FEWEST = 1024  # smallest number of environments for each of several threads
 

@@ -18,8 +18,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["CartesianControl", "Control", "Follower", "JointControl", "make_control"]
-
 _TRIES = 6  # largest number of tries to scale a joint step down to the step limit
 _AIM = 0.9995  # fraction of the step limit that a try aims at
 USABLE = 0.95

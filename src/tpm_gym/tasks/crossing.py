@@ -16,8 +16,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
-__all__ = ["Crossing"]
-
 STRIPE: Final = 0.003
 """Half width of the stripe on the table that shows the plane y = 0, m."""
 

@@ -19,8 +19,6 @@ from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task, dense
 from tpm_gym.tasks.timing import timed
 
-__all__ = ["Cycle"]
-
 STROKE: Final = 0.305
 RISE: Final = 0.025
 """Size of P's path, m: P moves up by RISE, by STROKE along x, and down by RISE."""

@@ -16,8 +16,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block
 from tpm_gym.tasks.control import Control
 
-__all__ = ["Motion", "Move", "hanging"]
-
 RAMP = 0.120
 """Time from rest to full speed, s."""
 ROUNDING = 1e-5

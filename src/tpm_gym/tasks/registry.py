@@ -9,8 +9,6 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine, find_machine
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TASKS", "make_task", "option_name"]
-
 TASKS: dict[str, type[Task]] = {}
 """Classes of the registered tasks by name; :func:`tpm_gym.register_task` fills it."""
 

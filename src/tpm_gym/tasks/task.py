@@ -28,8 +28,6 @@ from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
-__all__ = ["Entry", "Task", "dense"]
-
 Values = tuple[float, ...]
 
 _ZERO = (0.0, 0.0, 0.0)
