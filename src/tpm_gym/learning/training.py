@@ -10,7 +10,7 @@ import json
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -152,10 +152,9 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         changed = resumed(config, stored, content.step if content else 0)
         resumption = {"from_step": content.step if content else 0, **provenance.origin()}
-        changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
         description = {
             **stored,
-            **{name: getattr(changed, name) for name in changeable},
+            **{name: getattr(changed, name) for name in _CHANGEABLE},
             "resumed": [*stored.get("resumed", []), resumption],
         }
         return _Session(changed, console, store, description, content).run()
