@@ -261,7 +261,6 @@ def make_shield(
     Args:
         shield: The conditioning to keep, or True for the machine's ``safe_conditioning``.
         machine: Nominal machine.
-        control: Control of the environment.
         follower: Limit of the control's commands, if their accelerations are bounded.
         exact: Whether the robot follows its commands exactly. If it does not, the conditioning to
             keep with ``shield=True`` is (1 + :data:`MARGIN`) times ``safe_conditioning``.
@@ -341,10 +340,7 @@ def solved(
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.
         lack: (r,) conditioning that is lacking at ``point``.
-        wanted: See :class:`Problem`.
-        last: See :class:`Problem`.
-        low: See :class:`Problem`.
-        high: See :class:`Problem`.
+        wanted, last, low, high: See :class:`Problem`.
 
     Returns:
         Points (r, 3) m, and how far (r,) they are from ``point`` in units of the action.
