@@ -66,8 +66,7 @@ class Crossing(Task):
         """Move straight to the goal; the velocity is constant except near the two ends."""
         goal = motion.machine.mount.to_paper(motion.goal)
         yield from motion.go([goal], vacuum=False)
-        while True:
-            yield Move(goal, False)
+        yield Move(goal, False)
 
 
 def _stripe(machine: Machine) -> Patch:

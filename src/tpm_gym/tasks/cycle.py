@@ -170,7 +170,6 @@ class Cycle(Task):
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
         """Return the box of all goals at each end of the path: low, high corner (3,) m, world."""
-        del block
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []
         for end in self._ends.tolist():

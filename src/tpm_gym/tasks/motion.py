@@ -49,7 +49,6 @@ class Motion:
     The speed of a move rises, holds and falls (see :meth:`trapezoid`).
 
     Attributes:
-        machine: The machine that moves.
         period: Control period, s.
         seen: The observation in SI units, by entry, world frame.
         goal: The goal, m, world frame.
@@ -166,7 +165,6 @@ class Motion:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
 
         Args:
-            block: The block.
             clearance: Height over the block from where P comes down, m.
             gently: Whether P stops above the block, and then comes down slowly until the cup seals.
                 Otherwise the cup presses the block on the table.

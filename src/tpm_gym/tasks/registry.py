@@ -28,8 +28,7 @@ def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -
     """Make a task from its name or class, or return the task itself.
 
     Args:
-        task: Name, class or task.
-        machine: The machine; None for the paper's machine.
+        machine: Machine or its name; None for the paper's machine.
         options: Options of :class:`Task`; None keeps a default.
 
     Raises:

@@ -206,7 +206,6 @@ class Task(ABC):
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return weighted terms of the reward that do not depend on the goal: name -> (n,)."""
-        del state
         return {}
 
     def observed(self) -> tuple[Entry, ...]:
@@ -215,12 +214,10 @@ class Task(ABC):
         return (*self.robot_entries(), *chain(*objects))
 
     def departures(self, goals: FloatArray) -> FloatArray | None:
-        """Return the starts of P in episodes with ``goals`` (r, goal_size) m, world.
+        """Return the starts of P (r, 3) m, machine's frame, for goals (r, goal_size) m, world.
 
-        Returns:
-            (r, 3) m, machine's frame; None for the machine's home.
+        None stands for the machine's home.
         """
-        del goals
         return None
 
     # -- reward: here and nowhere else ------------------------------------------------------------
@@ -284,10 +281,7 @@ class Task(ABC):
     def start(
         self, rngs: Sequence[np.random.Generator], options: Any = None
     ) -> dict[str, FloatArray]:
-        """Sample the starts of r episodes, and apply ``reset(options=...)``.
-
-        Returns:
-            As :meth:`sample`.
+        """Sample the starts of r episodes as :meth:`sample`, and apply ``reset(options=...)``.
 
         Raises:
             ResetOptionError: If an option is unknown, is not a finite array of the right shape, or
@@ -354,20 +348,13 @@ class Task(ABC):
         return points
 
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
-        """Return the low and high corners (3,) m of the places where a block may start.
-
-        The default is :meth:`reach_of`. A task with other starts overrides this method.
-        """
+        """Return low and high corner (3,) m of the starts of a block; default: :meth:`reach_of`."""
         return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the boxes in which goals lie, as low and high corners (3,) m each.
+        """Return the boxes in which goals of a block lie, or of P for None; default: its reach.
 
-        By default there is one box: the reach of point P, or of a block in the cup. A task with
-        goals elsewhere overrides this method.
-
-        Args:
-            block: Block that has to reach the goals; None for goals of point P.
+        Each box is a pair of low and high corner (3,) m.
         """
         return [self.reach_of(block)]
 
