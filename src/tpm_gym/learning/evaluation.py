@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
 from tpm_gym.envs.vector import TPMVectorEnv
@@ -233,7 +233,8 @@ def _evaluate_one(
 @contextmanager
 def bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], object]]:
     """Show a progress bar on a terminal; yield a function that advances it."""
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         yield partial(bar.advance, bar.add_task(text, total=total))
 
 
