@@ -60,10 +60,7 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_shield(words: Sequence[str]) -> bool | float:
-    """Parse the words after ``--shield``: True, False or a conditioning.
-
-    If no word follows ``--shield``, return True.
-    """
+    """Parse the words after ``--shield``: True, False or a conditioning; no word means True."""
     text = " ".join(words) or "True"
     return text == "True" if text in ("True", "False") else float(text)
 
