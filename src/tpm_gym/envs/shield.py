@@ -7,14 +7,8 @@ conditioning 1/cond(J) stays at ``least`` or above on this curve and this line. 
 to hold the last command c: P then moves on the line from b to c, and the check of c included this
 line.
 
-The curve and the line lie in the triangle of b, c and d. The safe part of the region is almost
-convex. Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning
-= least``. This point is found by sequential quadratic programming, and its path is checked. If the
-check fails, the search is repeated with a larger conditioning as its aim. If all searches fail, the
-command is moved towards the last command.
-
-If a task bounds the accelerations of commands, a robot cannot hold the last command at once. For
-such tasks, :class:`BrakingShield` allows only commands after which the robot can brake in time.
+Sequential quadratic programming finds the nearest safe command; docs/shield.md says why it can.
+:class:`BrakingShield` is for tasks in which a robot cannot hold the last command at once.
 
 Importing this module imports Numba.
 """

@@ -310,7 +310,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         Raises:
             EpisodeError: If no episode is running.
         """
-        self._require_open()
         states = [vars(part.core.state) for part in self._parts]
         if len(states) == 1:
             return State(**states[0])
@@ -351,7 +350,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         Raises:
             EpisodeError: If no episode is running.
         """
-        self._require_open()
         return [part.core.save(elapsed=part.elapsed, ended=part.ended) for part in self._parts]
 
     def restore_state(self, snapshots: Sequence[EnvSnapshot]) -> Observation:

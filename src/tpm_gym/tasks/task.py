@@ -427,24 +427,14 @@ class Task(ABC):
         """
         centre, extent, speed, _ = self._scales()
         name, near = self.scene.objects[index].name, tuple(min(0.1, max(0.02, e)) for e in extent)
+        flat, unit = (0.0, 0.0), (1.0, 1.0)
+        gauge = f"vacuum, measured by a gauge, 0 to 1; 0 if the {name} is not held"
         rows: tuple[tuple[str, str, str, Values, Values], ...] = (
             ("position", "m", f"centre of the {name}, from a camera", centre, extent),
             ("offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near),
             ("velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed),
-            (
-                "tilt",
-                "-",
-                f"x and y of the unit vector along the {name}'s z axis",
-                (0.0, 0.0),
-                (1.0, 1.0),
-            ),
-            (
-                "held",
-                "-",
-                f"vacuum, measured by a gauge, 0 to 1; 0 if the {name} is not held",
-                (0.5,),
-                (0.5,),
-            ),
+            ("tilt", "-", f"x and y of the unit vector along the {name}'s z axis", flat, unit),
+            ("held", "-", gauge, (0.5,), (0.5,)),
         )
         ends = np.cumsum([9 + 12 * index, *(len(row[-1]) for row in rows)]).tolist()
         entries = tuple(
@@ -456,7 +446,7 @@ class Task(ABC):
         if not turn:
             return entries
         meaning, source = f"cosine and sine of 4 times the yaw of the {name}", partial(_turn, index)
-        return (*entries, Entry(f"{name}_turn", "-", meaning, (0.0, 0.0), (1.0, 1.0), source))
+        return (*entries, Entry(f"{name}_turn", "-", meaning, flat, unit, source))
 
     def _measure(self, state: State) -> FloatArray:
         """Return the measurements (n, 9 + 12 k): 9 of the robot, and 12 of each of k objects."""
