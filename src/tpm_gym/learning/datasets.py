@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -293,7 +292,7 @@ def _require_free(dataset: Dataset) -> None:
     if not dataset.config.overwrite:
         raise ConfigError(f"{dataset.folder} is there already; give --overwrite, or another --out")
     try:
-        ours = _OURS in json.loads((dataset.folder / _DATA / _METADATA).read_bytes())
+        ours = _OURS in provenance.read_json(dataset.folder / _DATA / _METADATA)
     except (OSError, ValueError):
         ours = False
     if not ours:

@@ -1,7 +1,7 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
 The policy acts with its exploration. The episodes have seeds of their own and do not affect the
-training. The moments are spread evenly over the steps after demonstrations.
+training. The moments are spread evenly over the steps after the demonstrations, if there are any.
 """
 
 from collections.abc import Callable, Iterator

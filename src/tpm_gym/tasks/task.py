@@ -312,33 +312,28 @@ class Task(ABC):
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
         """Check the user's options, and return their values by name."""
-        objects = self.scene.objects
-        known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
-            **{block.name: (3, (block,)) for block in objects},
-            "goal": (self.goal_size, objects or (None,)),
+        objects, belt = self.scene.objects, self.scene.belt
+        blocks: dict[str, tuple[Block | None, ...]] = {
+            **{block.name: (block,) for block in objects},
+            "goal": objects or (None,),
         }
-        belt = self.scene.belt
-        names = [*known] if belt is None else [*known, "belt_speed"]
-        valid = f"a dictionary with keys among {', '.join(map(repr, names))}"
+        valid = f"a dictionary with keys among {', '.join(map(repr, self._sizes))}"
         if not isinstance(options, Mapping):
             raise ResetOptionError("options", options, valid)
         chosen: dict[str, FloatArray] = {}
         for name, value in options.items():
-            if belt is not None and name == "belt_speed":
-                chosen[name] = belt.require(
-                    numbers("belt_speed", value, ResetOptionError).reshape(-1), 1, ResetOptionError
-                )
-                continue
-            if name not in known:
+            if name in blocks:
+                chosen[name] = self._within_reach(name, value, blocks[name])
+            elif belt is not None and name == "belt_speed":
+                speed = numbers(name, value, ResetOptionError).reshape(-1)
+                chosen[name] = belt.require(speed, 1, ResetOptionError)
+            else:
                 raise ResetOptionError(str(name), value, valid)
-            chosen[name] = self._within_reach(name, value, *known[name])
         return chosen
 
-    def _within_reach(
-        self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
-    ) -> FloatArray:
+    def _within_reach(self, name: str, value: Any, blocks: Sequence[Block | None]) -> FloatArray:
         """Copy points (size,) m that a user chose for P or for blocks; raise if out of reach."""
-        points = np.array(finite(name, value, (size,), ResetOptionError))
+        points = np.array(finite(name, value, (self._sizes[name],), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             boxes = self.goals_of(block) if name == "goal" else [self.starts_of(block)]
             margin = max(float(np.minimum(point - low, high - point).min()) for low, high in boxes)
@@ -352,7 +347,7 @@ class Task(ABC):
         return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the boxes in which goals of a block lie, or of P for None; default: its reach.
+        """Return the boxes of a block's goals, or of P's for None; by default :meth:`reach_of`.
 
         Each box is a pair of low and high corner (3,) m.
         """

@@ -39,7 +39,7 @@ def open_viewer(
 ) -> Viewer:
     """Start a viewer in the background; ``.address`` is its page and ``.close()`` ends it.
 
-    Arguments are those of :class:`ViewConfig`; ``machine`` may also be a machine.
+    Arguments are those of :class:`ViewConfig`; ``machine`` may also be a ``Machine``.
 
     Raises:
         MissingPackageError: If viser is not installed.
