@@ -346,7 +346,7 @@ def check_least(config: Any, least: int, *names: str) -> None:
 
 
 def check_seed(seed: int, count: int) -> None:
-    """Refuse ``count`` seeds from ``seed`` on if one is negative or held out, with a ConfigError."""
+    """Refuse ``count`` seeds from ``seed`` on, by a ConfigError, if any is negative or held out."""
     most = SELECTION_SEED - count
     problem = f"must lie in 0 ... {most}: seeds from {SELECTION_SEED} up are held out"
     _refuse(not 0 <= seed <= most, f"--seed {seed}: {problem}")

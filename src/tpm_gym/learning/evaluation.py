@@ -164,10 +164,7 @@ def _check(config: EvaluationConfig) -> None:
 
 
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
-    """Complete the options.
-
-    If env, machine, drive or shield is not given, its value is taken from the policies.
-    """
+    """Take env, machine, drive and shield from the policies if they are not given."""
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     if config.env is UNSET:
         if not trained:

@@ -120,8 +120,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
     A run that was killed before its first checkpoint begins again. A finished run is continued only
-    if it is given more steps. If a finished run is given no more steps, it is not trained. A
-    missing learning curve is then drawn, and a missing final test is run.
+    if it is given more steps. Otherwise, a missing learning curve is drawn, and a missing final
+    test is run.
 
     Raises:
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is

@@ -220,10 +220,7 @@ def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Return the replay buffer's position and views of its filled part, by name.
-
-    If the algorithm has no replay buffer, the dictionary is empty.
-    """
+    """Return the replay buffer's position and views of its filled part; empty without a buffer."""
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, DictReplayBuffer):
         return {}

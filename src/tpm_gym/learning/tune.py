@@ -93,10 +93,7 @@ class TuneConfig:
 
 
 def tune(config: TuneConfig) -> Path:
-    """Run a search and write the best recipe; Ray Tune prints a table while it runs.
-
-    Returns:
-        The recipe file.
+    """Run a search and write the best recipe; return its file. Ray Tune prints a table meanwhile.
 
     Raises:
         ConfigError: An option is not valid, the folder exists, or no training ended.
