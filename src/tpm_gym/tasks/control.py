@@ -47,10 +47,9 @@ class Control(Protocol):
         """Convert points (n, 3) m to coordinates (n, 3) whose differences are actions."""
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Return the derivative of P with respect to the action, at points (n, 3) m.
+        """Return the derivatives (n, 3, 3) m of P with respect to the action, at points (n, 3) m.
 
-        Returns:
-            Matrices (n, 3, 3), m. Column j belongs to component j of the action.
+        Column j belongs to component j of the action.
         """
 
 

@@ -49,6 +49,7 @@ class Motion:
     The speed of a move rises, holds and falls (see :meth:`trapezoid`).
 
     Attributes:
+        machine: The machine that moves.
         period: Control period, s.
         seen: The observation in SI units, by entry, world frame.
         goal: The goal, m, world frame.
