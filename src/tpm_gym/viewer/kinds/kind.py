@@ -1,7 +1,5 @@
 """Modes, postures and layers of a machine, as the viewer shows them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

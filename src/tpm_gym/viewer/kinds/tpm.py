@@ -1,7 +1,5 @@
 """Modes, postures and layers of the paper's mechanism."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
