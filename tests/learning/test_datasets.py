@@ -164,7 +164,7 @@ def test_datasets_of_two_engines_have_two_names(engine):
         ("--noise inf: must be finite", {"noise": float("inf")}),
         ("--env: give at least one", {"env": ()}),
         ("--kind: give at least one", {"kind": ()}),
-        ("--seed 999999: must be at most 999988", {"seed": 999_999}),
+        ("--seed 999999: must lie in 0 ... 999988", {"seed": 999_999}),
         ("--seed 999900: must lie in 0", {"seed": 999_900, "kind": ("random", "replay")}),
     ],
 )

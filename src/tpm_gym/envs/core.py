@@ -26,15 +26,6 @@ from tpm_gym.tasks.task import Task
 if TYPE_CHECKING:
     from tpm_gym.envs.shield import BrakingShield, Shield
 
-__all__ = [
-    "Core",
-    "EnvSnapshot",
-    "Observation",
-    "action_space",
-    "compute_reward",
-    "seed_of",
-]
-
 OBSERVATION_BOUND = 10.0
 GOAL_BOUND = 2.0
 
@@ -129,7 +120,8 @@ class Core:
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self.randomisation.require_fitting(self.machine)
         self._altered = self.randomisation != Randomisation()
-        self._follower = self._make_follower()
+        limits, period = self.task.accelerations, self.task.control_period
+        self._follower = None if limits is None else Follower(self.machine, *limits, period)
         self._shield = None if shield is False else self._make_shield(shield)
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
         self._pixels: Pixels | None = None
@@ -173,11 +165,6 @@ class Core:
         exact = self.drive is None and not self._altered
         return make_shield(shield, self.machine, self.control, self._follower, exact)
 
-    def _make_follower(self) -> Follower | None:
-        if self.task.accelerations is None:
-            return None
-        return Follower(self.machine, *self.task.accelerations, self.task.control_period)
-
     def _start(self) -> Simulation:
         return Simulation(
             self.task.scene,
@@ -198,15 +185,10 @@ class Core:
         Args:
             rows: (r,) environments.
             rngs: Their generators from now on.
-            options: As in :meth:`tpm_gym.TPMEnv.reset`.
+            options: As in :meth:`tpm_gym.TPMEnv.reset`, whose errors are raised.
 
         Returns:
             The randomisation of each episode; empty dictionaries without randomisation.
-
-        Raises:
-            ResetOptionError: If an option is not possible; the environments are then unchanged.
-            UnreachableError: If an object or the goal is out of reach; the environments are then
-                unchanged.
         """
         self.require_open()
         before = [rng.bit_generator.state for rng in rngs] if options is not None else []
@@ -316,11 +298,7 @@ class Core:
     # -- pictures ---------------------------------------------------------------------------
 
     def frame(self, row: int) -> Any:
-        """Draw an environment in its ``render_mode``.
-
-        Raises:
-            EpisodeError: If the environments are closed, or before the first reset.
-        """
+        """Draw an environment in its ``render_mode``; see :meth:`tpm_gym.TPMEnv.render`."""
         return self._rendering.frame(self.simulation, row, self._markers(row))
 
     def show(self) -> None:
@@ -348,25 +326,14 @@ class Core:
 
     @property
     def state(self) -> State:
-        """The state after the last step or reset.
-
-        Raises:
-            EpisodeError: If no episode is running.
-        """
+        """The state after the last step or reset; raise EpisodeError if no episode is running."""
         if self._state is None:
             self.require_open()
             raise EpisodeError("no episode is running; call reset() first")
         return self._state
 
     def save(self, **columns: NDArray[Any]) -> EnvSnapshot:
-        """Return a snapshot of everything that the next steps depend on.
-
-        Args:
-            columns: Further arrays to keep in the snapshot, by name.
-
-        Raises:
-            EpisodeError: If no episode is running.
-        """
+        """Return a snapshot; ``columns`` are further arrays to keep in it, by name."""
         _ = self.state  # raises without an episode
         rngs = [{**rng.bit_generator.state, "seed": seed_of(rng)} for rng in self.rngs]
         own = {"goals": self.goals, "pending": self._pending, "views": self._views, **columns}
@@ -381,13 +348,7 @@ class Core:
         return snapshot
 
     def restore(self, snapshot: Any) -> Observation:
-        """Continue from a snapshot of these or equal environments; return the observation.
-
-        Raises:
-            EpisodeError: If the environments are closed.
-            InputError: If ``snapshot`` is no snapshot of equal environments; the environments are
-                then unchanged.
-        """
+        """Continue from a snapshot, as :meth:`tpm_gym.TPMEnv.restore_state`."""
         self.require_open()
         self.require_equal(snapshot)
         self.rngs = [np.random.default_rng(state.get("seed")) for state in snapshot.rngs]
@@ -515,11 +476,7 @@ def _not_finite(
 
 
 def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:
-    """Compute the reward of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`.
-
-    Raises:
-        InputError: If the goals are no real numbers of fitting shapes, or ``info`` does not fit.
-    """
+    """Compute rewards of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`."""
     _require_goals(task.goal_size, achieved, desired)
     goal_term = np.asarray(task.goal_term(task.gap(achieved, desired)))
     try:

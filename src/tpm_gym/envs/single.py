@@ -31,8 +31,6 @@ from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TPMEnv"]
-
 Action = NDArray[Any]
 
 _ROW = np.array([0])
@@ -309,7 +307,6 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If a method of the task returns a wrong shape, type or value.
         """
         core, rng = self._core, None
-        core.require_open()
         if seed is not None:
             rng, seed = seeding.np_random(seed)
         (randomisation,) = core.reset(_ROW, [self.np_random if rng is None else rng], options)

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
 from tpm_gym.envs.vector import TPMVectorEnv
@@ -140,7 +140,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     count = min(config.episodes, BATCH) if config.env_options.in_batches else 1
     with closing(_make_envs(config, count)) as envs:
         # All policies are loaded before the first one runs, so that a mistyped name fails at once.
-        policies = list(zip(config.policy, _load(config, envs), strict=True))
+        policies = [(spec, load_policy(spec, envs)) for spec in config.policy]
         results = [_evaluate_one(envs, *policy, config, console) for policy in policies]
     console.print(_table(config, results))
     if config.json is not None:
@@ -164,10 +164,7 @@ def _check(config: EvaluationConfig) -> None:
 
 
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
-    """Complete the options.
-
-    If env, machine, drive or shield is not given, its value is taken from the policies.
-    """
+    """Take env, machine, drive and shield from the policies if they are not given."""
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     if config.env is UNSET:
         if not trained:
@@ -220,10 +217,6 @@ def _make_envs(
     return make_envs(config.env, count, **pictures, **options)
 
 
-def _load(config: EvaluationConfig, envs: TPMVectorEnv) -> list[Policy]:
-    return [load_policy(spec, envs) for spec in config.policy]
-
-
 def _evaluate_one(
     envs: TPMVectorEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
 ) -> Result:
@@ -237,7 +230,8 @@ def _evaluate_one(
 @contextmanager
 def bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], object]]:
     """Show a progress bar on a terminal; yield a function that advances it."""
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         yield partial(bar.advance, bar.add_task(text, total=total))
 
 
@@ -301,7 +295,7 @@ def _film(config: EvaluationConfig, console: Console) -> None:
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
-        policies = _load(config, envs)
+        policies = [load_policy(spec, envs) for spec in config.policy]
         fps = envs.metadata["render_fps"]
         films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
             ("video", config.video, count, partial(write_video, fps=fps)),

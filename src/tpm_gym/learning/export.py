@@ -30,9 +30,7 @@ from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-4
-"""Largest error of an exported action, relative to half the action's range.
-
-If half the range is less than 1, the absolute error counts.
+"""Largest error of an exported action, relative to the larger of 1 and half the action's range.
 
 Single precision rounds the actions of networks with large weights by 1e-5. Wrong weights or a wrong
 activation cause far larger errors.
@@ -64,10 +62,8 @@ def save(
 ) -> Path:
     """Write the policy of a model; return the path of the JSON file.
 
-    The files are ``path``.safetensors and ``path``.json.
-
-    They get their final names only after a check that the written policy acts like the model.
-    A policy that the files cannot express is therefore refused, not changed.
+    The files ``path``.safetensors and ``path``.json get these names only after a check that the
+    written policy acts like the model. A policy that they cannot express is refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
@@ -151,11 +147,8 @@ def convert(
 ) -> Path:
     """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`, or copy an exported policy.
 
-    Args:
-        evaluation: Results for a model card, which are checked before anything is written.
-
-    Returns:
-        The JSON file.
+    Return the JSON file. ``evaluation`` has results for a model card, which are checked before
+    anything is written.
     """
     if not archive.is_file():
         raise ConfigError(f"MODEL {archive}: no such file; give best.zip or last.zip of a run")

@@ -10,7 +10,7 @@ import json
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -38,7 +38,7 @@ from tpm_gym.learning.errors import (
     PolicyError,
     RunError,
 )
-from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.evaluation import EvaluationConfig, bar, evaluate
 from tpm_gym.learning.recipes import shipped_for
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import (
@@ -120,8 +120,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
     A run that was killed before its first checkpoint begins again. A finished run is continued only
-    if it is given more steps. If a finished run is given no more steps, it is not trained. A
-    missing learning curve is then drawn, and a missing final test is run.
+    if it is given more steps. Otherwise, a missing learning curve is drawn, and a missing final
+    test is run.
 
     Raises:
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
@@ -152,23 +152,18 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         changed = resumed(config, stored, content.step if content else 0)
         resumption = {"from_step": content.step if content else 0, **provenance.origin()}
-        changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
         description = {
             **stored,
-            **{name: getattr(changed, name) for name in changeable},
+            **{name: getattr(changed, name) for name in _CHANGEABLE},
             "resumed": [*stored.get("resumed", []), resumption],
         }
         return _Session(changed, console, store, description, content).run()
 
 
 def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the configuration ``saved``, with the options of ``newest`` that resuming can change.
+    """Return the configuration ``saved`` in a checkpoint, with changeable options of ``newest``.
 
-    These options differ if an earlier resumption was killed before its first checkpoint.
-
-    Args:
-        saved: Configuration in the checkpoint.
-        newest: Configuration in the folder of the run.
+    ``newest``, in the run folder, differs if a resumption was killed before its first checkpoint.
     """
     given = {name: newest.get(name) for name in _CHANGEABLE}
     return saved | {n: value for n, value in given.items() if isinstance(value, _CHANGEABLE[n])}
@@ -213,7 +208,7 @@ class _Session:
         with ExitStack() as stack:
             training_envs = stack.enter_context(training_envs_of(config))
             envs = stack.enter_context(closing(make_envs(count=count, **config.env_arguments)))
-            bar = stack.enter_context(closing(callbacks.ProgressBar(self.console)))
+            advance = stack.enter_context(bar(self.console, "training", config.steps))
             model = make_model(config, training_envs)
             seconds, earlier = self._begin(model)
             keep = partial(self._keep, run_folder.BEST_FILE)
@@ -223,7 +218,7 @@ class _Session:
             )
             stack.callback(model.logger.close)
             # Checkpointing sets the clock that the callbacks after it read.
-            called: list[BaseCallback] = [checkpointing, bar, evaluation]
+            called: list[BaseCallback] = [checkpointing, callbacks.Progress(advance), evaluation]
             if config.recipe.demonstrations:
                 called.insert(1, Demonstrations(**config.recipe.demonstrations))
             with listener.listening():
@@ -238,8 +233,7 @@ class _Session:
     def _begin(self, model: BaseAlgorithm) -> tuple[float, list[dict[str, Any]]]:
         """Set model, files and logs to the beginning or the checkpoint.
 
-        Returns:
-            Training time so far, s, and the evaluations so far.
+        Return the training time, s, and the evaluations so far.
         """
         config, content, seconds, evaluations = self.config, self.content, 0.0, []
         if content is None:
@@ -310,8 +304,7 @@ class _Session:
     def complete(self) -> bool:
         """Draw the learning curve and run the final test, if a killed process has not done so.
 
-        Returns:
-            Whether the final test ran.
+        Return whether the final test ran.
         """
         config = self.config
         if not (config.run / CURVE_FILE).exists():

@@ -1,7 +1,5 @@
 """Check that a task can start, and that a state has equal results alone and in a batch."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -13,8 +11,6 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import Scene, State
 from tpm_gym.tasks.task import Task
-
-__all__ = ["check"]
 
 _EXAMPLES = 7
 """Number of states with which a task is checked.

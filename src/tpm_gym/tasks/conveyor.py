@@ -18,8 +18,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task, dense
 
-__all__ = ["Conveyor"]
-
 SPEEDS: Final = (0.05, 0.20)
 """Lowest and highest speed of the belt, m/s."""
 LATEST: Final = 1.0

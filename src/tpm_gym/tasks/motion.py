@@ -16,8 +16,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block
 from tpm_gym.tasks.control import Control
 
-__all__ = ["Motion", "Move", "hanging"]
-
 RAMP = 0.120
 """Time from rest to full speed, s."""
 ROUNDING = 1e-5
@@ -174,7 +172,6 @@ class Motion:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
 
         Args:
-            block: The block.
             clearance: Height over the block from where P comes down, m.
             gently: Whether P stops above the block, and then comes down slowly until the cup seals.
                 Otherwise the cup presses the block on the table.

@@ -16,8 +16,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task, dense
 
-__all__ = ["Push"]
-
 CLEARANCE: Final = 0.008
 """Gap between lip and block, m: first above the block's top, then beside the pushed face."""
 SHORTEST: Final = 0.060

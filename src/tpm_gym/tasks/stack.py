@@ -14,8 +14,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Task, dense
 
-__all__ = ["Stack"]
-
 CLEARANCE: Final = 0.045
 """Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 

@@ -17,8 +17,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Task, dense
 
-__all__ = ["Throw"]
-
 NEAREST: Final = 0.040
 FARTHEST: Final = 0.150
 """Bounds (NEAREST, FARTHEST) of the distance of goals from the region's end along x, m."""

@@ -6,8 +6,6 @@ parameterisation limit only the torque at every point. So this module computes t
 convex problem.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
@@ -16,8 +14,6 @@ from numpy.typing import ArrayLike
 from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
-
-__all__ = ["timed"]
 
 _STEPS: Final = 50
 _TOLERANCE: Final = 1e-9

@@ -1,7 +1,5 @@
 """Layers around the robot: singular surfaces, aspects, workspace, regions, slices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations
 from operator import ne
@@ -60,11 +58,7 @@ class Layers:
         self._keys: dict[str, Any] = {}
 
     def around(self, posture: Posture) -> Mapping[str, Found]:
-        """Return the available layers of a posture, by name.
-
-        These are the layer "region", with the boxes of the commands and of the goals, and the
-        layers that :meth:`Kind.layers` returns.
-        """
+        """Return the layers of a posture by name: "region", and those of :meth:`Kind.layers`."""
         machine = self._kind.machine
         regions = {"region": machine.region, "goals": machine.goal_region}
         return {"region": ("always", lambda: regions), **self._kind.layers(posture)}

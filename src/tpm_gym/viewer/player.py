@@ -1,7 +1,5 @@
 """Episodes of any task, engine and policy, one step at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -75,9 +73,6 @@ class Player:
     """An environment and a policy that acts in it.
 
     Args:
-        env_id: Id of the environment.
-        engine: Name of the engine.
-        machine: The robot.
         policy: ``expert``, ``random``, the id of a published policy, or the path of an exported
             one.
 
@@ -122,7 +117,6 @@ class Player:
 
     def _draw(self, observation: Any) -> Any:
         """Return a uniform action; the draws of an episode depend on its seed alone."""
-        del observation
         space: Any = self._env.action_space
         return self._rng.uniform(space.low, space.high).astype(space.dtype)
 

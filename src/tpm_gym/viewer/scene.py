@@ -1,7 +1,5 @@
 """Robot, table and objects as nodes of a viser scene."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -50,7 +48,6 @@ class RobotScene:
 
     Args:
         scene: Scene of a viser server or client.
-        machine: The robot.
 
     Attributes:
         links: Nodes of the links by name, below :data:`ROBOT`.

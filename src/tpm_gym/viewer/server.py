@@ -1,7 +1,5 @@
 """Viser server at a given address and port, without console output."""
 
-from __future__ import annotations
-
 import errno
 import io
 import socket

@@ -1,7 +1,5 @@
 """Modes, postures and layers of a Delta."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Modes, postures and layers of a machine, as the viewer shows them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -132,7 +130,6 @@ class Kind:
                 and no rotated posture exists at ``position``.
             UnreachableError: If ``operation`` is "translating" and ``position`` is out of reach.
         """
-        del operation, working, tilt
         theta = self.machine.require_inverse(np.array(vector("position", position)))
         return self.at_joints(theta, None)
 
@@ -173,7 +170,6 @@ class Kind:
         - conditioning: a mesh, and the conditionings at its vertices;
         - margin: a :class:`Margin`, or None.
         """
-        del posture
         return {}
 
 
