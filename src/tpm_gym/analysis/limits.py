@@ -1,5 +1,7 @@
 """Limits for :mod:`tpm_gym.analysis.aspects`, such as the stops of the motors."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np

@@ -8,6 +8,8 @@ one angle, so the nearest point of a surface is found by a search over this angl
 of arcs, one for each interval of the angle in which the curve is real.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial

@@ -14,6 +14,8 @@ right-handed turn about y: link 3' points along (cos phi, 0, -sin phi). A vector
 written as a complex number x + i z, so the direction of link 3' is exp(-i phi).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

@@ -3,6 +3,8 @@
 Vectors are in the base's frame.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Final, get_args, get_type_hints
 

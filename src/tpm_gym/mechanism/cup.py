@@ -3,6 +3,8 @@
 Engines simulate the cup; all engines use :func:`sealed`.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -3,6 +3,8 @@
 torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
 """
 
+from __future__ import annotations
+
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence

@@ -13,6 +13,8 @@ point with which it moves. Some bodies swing with their rods, and some rods also
 own axes; see :class:`Swing`.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 

@@ -3,6 +3,8 @@
 MuJoCo closes loops itself. Each ball joint of a loop is an equality constraint between two sites.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from xml.etree.ElementTree import Comment, Element, indent, tostring
 

@@ -14,6 +14,8 @@ largest torque at a speed w is K^2 (w0 - w). So the peak torque T is available u
 speed, w0 - T / K^2.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Literal
 

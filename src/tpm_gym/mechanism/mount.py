@@ -1,5 +1,7 @@
 """Mount of the robot over the table: conversion between machine's frame and world frame."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from functools import cached_property

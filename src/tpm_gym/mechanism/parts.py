@@ -1,5 +1,7 @@
 """Sizes and materials of the arms, rods and motors of mechanisms."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from typing import Final, Literal
 

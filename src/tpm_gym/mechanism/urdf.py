@@ -9,6 +9,8 @@ joints. With the two files alone, Pinocchio closes the loops:
 base hangs upside down over a table, so objects fall along +z.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 from dataclasses import replace

@@ -10,6 +10,8 @@ diagonal blocks: the second moments of the mass (3, 3), and the mass. So the tor
 trace(dF/dtheta H F''^T) over the bodies, without angular velocities.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Compiled loops over robots, used with all engines. Importing this module imports Numba."""
 
+from __future__ import annotations
+
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,5 +1,7 @@
 """Check for a display. Without a display, an engine that opens a window may end the process."""
 
+from __future__ import annotations
+
 import ctypes
 import os
 import sys

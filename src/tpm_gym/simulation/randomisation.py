@@ -5,6 +5,8 @@ one episode. The controller, the forward kinematics of the observation and the e
 nominal machine, as on a real robot.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any

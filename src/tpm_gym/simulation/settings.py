@@ -1,5 +1,7 @@
 """Numerical settings that all engines share, and their conversion from mappings."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar

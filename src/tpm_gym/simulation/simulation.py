@@ -4,6 +4,8 @@ The engine simulates the robots. This module adds encoder errors, records which 
 their assembly mode or working mode, and computes the State.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

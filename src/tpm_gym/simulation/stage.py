@@ -1,5 +1,7 @@
 """Table, belt, floor, goal markers and light of all engines; world frame."""
 
+from __future__ import annotations
+
 from typing import Final, NamedTuple
 
 from tpm_gym.arrays import Vector

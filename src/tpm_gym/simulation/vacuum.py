@@ -6,6 +6,8 @@ friction can transmit. The engine computes the load. It also calls
 :func:`tpm_gym.mechanism.cup.sealed` to find the object that the lip touches.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any, NamedTuple
 

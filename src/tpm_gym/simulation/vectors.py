@@ -1,5 +1,7 @@
 """Vector algebra on tuples of three floats, for compiled functions."""
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

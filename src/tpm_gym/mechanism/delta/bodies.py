@@ -7,6 +7,8 @@ frames of an arm, its crosses and its rods have x along the arm and y along the 
 frame of the platform is parallel to the base's frame.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import replace
 from typing import Final, NamedTuple

@@ -1,5 +1,7 @@
 """The Delta as a machine, with the lengths of ABB's IRB 360 or with other lengths."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar

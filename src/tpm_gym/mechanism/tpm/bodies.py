@@ -17,6 +17,8 @@ When all joints are at zero, all frames are parallel to the machine's frame, and
 along +y (branch I) or +x (branches II, III). Units: metres, radians, kilograms.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Literal
 

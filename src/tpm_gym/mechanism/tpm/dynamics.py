@@ -23,6 +23,8 @@ Units are SI. In the machine's frame, gravity points along +z, as the base hangs
 Functions with a Pose take floats, arrays or tensors, as in :mod:`tpm_gym.kinematics.equations`.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 

@@ -1,5 +1,7 @@
 """Sixteen constants of the TPM's bodies for :mod:`tpm_gym.mechanism.tpm.dynamics`."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The translational parallel mechanism as a machine, with the paper's lengths or others."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar

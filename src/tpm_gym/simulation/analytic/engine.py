@@ -10,6 +10,8 @@ after another.
 The readings ``gap`` and ``tilt`` are always 0; use another engine to measure them.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any, Final

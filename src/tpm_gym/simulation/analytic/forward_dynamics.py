@@ -1,5 +1,7 @@
 """Forward dynamics with semi-implicit time steps: joint velocities first, then joint positions."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -8,6 +8,8 @@ normal to the plane is zero. There, the motors cannot accelerate P in this direc
 its speed.
 """
 
+from __future__ import annotations
+
 from typing import Any, Final, NamedTuple
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Numerical settings of the analytic engine."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from tpm_gym.errors import ConfigurationError

@@ -3,6 +3,8 @@
 Each robot is computed separately, so that its result does not depend on the other robots.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

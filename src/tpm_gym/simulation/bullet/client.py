@@ -1,5 +1,7 @@
 """PyBullet's functions, bound to one physics client."""
 
+from __future__ import annotations
+
 import ctypes
 import importlib.util
 import itertools

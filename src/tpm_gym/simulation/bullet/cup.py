@@ -1,5 +1,7 @@
 """Vacuum cup in PyBullet: a fixed joint (weld) holds an object until the vacuum law releases it."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 

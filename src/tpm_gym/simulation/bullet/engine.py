@@ -1,5 +1,7 @@
 """Engine that simulates one robot with PyBullet."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

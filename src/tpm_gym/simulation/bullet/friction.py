@@ -25,6 +25,8 @@ falls below :data:`_LEAST`. A level contact between two objects has the friction
 sticks, and in the first time step of a slide.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from functools import partial

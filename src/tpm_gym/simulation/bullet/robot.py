@@ -6,6 +6,8 @@ and the loop opens at once. With closures between multibodies, the forces are ex
 (docs/loops.md). Separate multibodies also make the constraint rows of the solver shorter.
 """
 
+from __future__ import annotations
+
 import os
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,5 +1,7 @@
 """Table, floor, objects and camera in PyBullet."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

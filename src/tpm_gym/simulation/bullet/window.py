@@ -1,5 +1,7 @@
 """Window of PyBullet, which shows a second copy of the robot and its scene."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import pybullet

@@ -1,5 +1,7 @@
 """Vacuum cup in MuJoCo: a weld holds an object until the vacuum law releases it."""
 
+from __future__ import annotations
+
 import math
 
 import mujoco

@@ -1,5 +1,7 @@
 """MuJoCo model of robot, table, floor and objects, with the pairs of geoms that can collide."""
 
+from __future__ import annotations
+
 from itertools import combinations
 from xml.etree.ElementTree import Element, tostring
 

@@ -1,5 +1,7 @@
 """Numerical settings of MuJoCo."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 from tpm_gym.arrays import is_number, is_whole

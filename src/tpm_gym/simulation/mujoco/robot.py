@@ -8,6 +8,8 @@ half of a time step (``mj_step1``) creates the friction constraints. Then this m
 target velocities. The second half (``mj_step2``) computes the forces.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,5 +1,7 @@
 """Objects in MuJoCo."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

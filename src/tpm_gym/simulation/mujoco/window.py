@@ -1,5 +1,7 @@
 """Window of MuJoCo: its passive viewer."""
 
+from __future__ import annotations
+
 from typing import Any
 
 import mujoco

@@ -6,6 +6,8 @@ common normals of two edges (separating axes). Contacts are detected before the 
 that the solver can stop the bodies at the surface and no penetration has to be removed.
 """
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 

@@ -8,6 +8,8 @@ Stem and platform do not collide with objects. The lip does not collide with the
 spring has no end stop. Within a time step, contacts do not move point P.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

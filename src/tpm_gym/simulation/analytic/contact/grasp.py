@@ -1,5 +1,7 @@
 """Cup on its spring, and the object that it holds by vacuum."""
 
+from __future__ import annotations
+
 from typing import NamedTuple
 
 from tpm_gym.arrays import Vector, rotate

@@ -4,6 +4,8 @@ Velocities are computed first, then positions. There is no restitution. A time s
 fraction of each penetration. The iterations start from the impulses of the last time step.
 """
 
+from __future__ import annotations
+
 import math
 from typing import NamedTuple
 

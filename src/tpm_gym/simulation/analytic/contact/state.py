@@ -1,5 +1,7 @@
 """State of objects and cups, and workspace of the contact solver."""
 
+from __future__ import annotations
+
 from typing import Any, Final, NamedTuple
 
 import numpy as np

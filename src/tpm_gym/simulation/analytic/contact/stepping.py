@@ -3,6 +3,8 @@
 A table is skipped for a whole control period if its objects are at rest and the lip stays away.
 """
 
+from __future__ import annotations
+
 import math
 
 import numpy as np
