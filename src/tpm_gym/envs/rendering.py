@@ -1,5 +1,7 @@
 """Frames of environments, as render() returns them."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -13,6 +13,8 @@ Sequential quadratic programming finds the nearest safe command; docs/shield.md 
 Importing this module imports Numba.
 """
 
+from __future__ import annotations
+
 from functools import cache
 from typing import Any, NamedTuple
 

@@ -1,5 +1,7 @@
 """Check that a task can start, and that a state has equal results alone and in a batch."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 

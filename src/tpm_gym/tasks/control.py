@@ -5,6 +5,8 @@ from the last command. So the simulation can follow every command. Arrays have r
 in the machine's frame.
 """
 
+from __future__ import annotations
+
 from typing import Protocol
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Registry of tasks, and their names in options."""
 
+from __future__ import annotations
+
 import re
 from typing import Any
 

@@ -6,6 +6,8 @@ parameterisation limit only the torque at every point. So this module computes t
 convex problem.
 """
 
+from __future__ import annotations
+
 from typing import Final
 
 import numpy as np

@@ -1,5 +1,7 @@
 """Tab "Explore": the user chooses a posture by point P, motors and modes."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Mapping
 from html import escape

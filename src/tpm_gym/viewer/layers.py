@@ -1,5 +1,7 @@
 """Layers around the robot: singular surfaces, aspects, workspace, regions, slices."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Mapping, Sequence
 from itertools import combinations
 from operator import ne

@@ -1,5 +1,7 @@
 """Triangle meshes of singular surfaces and of sets of cells; machine's frame, m."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final, NamedTuple

@@ -1,5 +1,7 @@
 """Tab "Play": episodes of tasks, with reward terms and torques plotted while they run."""
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,5 +1,7 @@
 """Episodes of any task, engine and policy, one step at a time."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec

@@ -1,5 +1,7 @@
 """Robot, table and objects as nodes of a viser scene."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final

@@ -1,5 +1,7 @@
 """Viser server at a given address and port, without console output."""
 
+from __future__ import annotations
+
 import errno
 import io
 import socket

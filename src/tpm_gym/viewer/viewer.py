@@ -1,5 +1,7 @@
 """Viewer: server of a page that shows the robot and, beside the robot, a panel with controls."""
 
+from __future__ import annotations
+
 import math
 import traceback
 from html import escape

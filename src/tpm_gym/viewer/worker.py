@@ -1,5 +1,7 @@
 """Thread that runs all changes of the viewer, one after the other."""
 
+from __future__ import annotations
+
 import threading
 import time
 from collections.abc import Callable

@@ -1,5 +1,7 @@
 """Kinds of machines: modes, postures and layers in the viewer, in one file for each mechanism."""
 
+from __future__ import annotations
+
 from typing import Any, Final
 
 from tpm_gym.mechanism import Delta, Machine

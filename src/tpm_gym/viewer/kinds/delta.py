@@ -1,5 +1,7 @@
 """Modes, postures and layers of a Delta."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from typing import Any, Final
 

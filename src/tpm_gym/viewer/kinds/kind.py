@@ -1,5 +1,7 @@
 """Modes, postures and layers of a machine, as the viewer shows them."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,5 +1,7 @@
 """Modes, postures and layers of the paper's mechanism."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Final
