@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import tpm_gym
+from tpm_gym import learning
 from tpm_gym.learning import GoalGapExtractor, export, save_policy
 from tpm_gym.learning.command_line import main
 from tpm_gym.learning.configuration import EnvOptions
@@ -268,6 +270,14 @@ def test_what_is_converted_says_what_the_run_says(run, model, capsys):
     about = loaded.description
     assert (about.seed, about.recipe, about.env_options) == (5, RECIPE, {"machine": "wide"})
     assert about.versions == {"torch": "2.0.0", "tpm_gym": None}
+
+
+def test_the_command_says_what_it_does_before_pytorch_is_loaded(run, capsys, monkeypatch):
+    monkeypatch.delattr(learning, "export")
+    monkeypatch.setitem(sys.modules, "tpm_gym.learning.export", None)
+    with pytest.raises(ImportError):
+        main(["export", str(run), str(run / "out")])
+    assert capsys.readouterr().out.startswith(f"exporting {run} ")
 
 
 def test_the_command_line_does_not_touch_what_is_not_trusted(run):

@@ -61,6 +61,10 @@ Command = (
 )
 
 
+def _say_loading() -> None:
+    print("loading PyTorch ...", flush=True)
+
+
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command line, by default ``sys.argv``, and exit with its status.
 
@@ -75,8 +79,10 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         match command:
             case TrainingConfig():
+                _say_loading()
                 stopped_by = learning.train(command)
             case ResumeConfig():
+                _say_loading()
                 stopped_by = learning.resume(command)
             case EvaluationConfig():
                 evaluate(command)
@@ -87,9 +93,9 @@ def main(words: Sequence[str] | None = None) -> None:
             case ViewConfig():
                 run(command)
             case ExportConfig():
+                print(f"exporting {command.model} and comparing its actions ...", flush=True)
                 from tpm_gym.learning import export, model_card  # PyTorch is needed here only
 
-                print(f"exporting {command.model} and comparing its actions ...", flush=True)
                 evaluation = command.evaluation
                 policy = export.convert(
                     command.model,
