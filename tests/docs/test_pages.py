@@ -88,6 +88,8 @@ def understand(words):
             assert (ROOT / folder).is_dir()
         case ["tpm-gym", *options] | ["python", "-m", "tpm_gym.learning", *options]:
             tyro.cli(Command, args=options)
+        case ["python", "-m", "rl_zoo3.train", *_]:
+            pass  # tests/learning/test_zoo.py runs it
         case ["python", "-m", "benchmarks.studies", *options]:
             tyro.cli(StudiesCommand, args=options)
         case ["python", "benchmarks/engine_limits.py", *options]:

@@ -384,14 +384,14 @@ def _check_recipe(config: TrainingConfig) -> None:
     shown, envs, where = f"--steps {config.steps}", config.envs, f"--recipe {config.recipe_file}"
     _refuse(
         config.steps <= config.demonstrated,
-        f"{shown}: must be more than the {config.demonstrated:,} of the demonstrations; for a "
-        "short trial give fewer --demonstrations",
+        f"{shown}: must be more than the {config.demonstrated:,} of the demonstrations; give "
+        "more --steps, or fewer --demonstrations to tpm-gym train",
     )
     length = "train_freq" if config.argument("train_freq") else "n_steps"
     _refuse(
         config.steps - config.demonstrated < config.rollout,
         f"{shown}: one rollout takes {config.rollout:,} ({envs} environments x {length}); give "
-        "more steps, or fewer --envs",
+        "more --steps, or fewer --envs to tpm-gym train",
     )
     if config.argument("normalize_advantage"):
         sizes = {length: config.rollout, "batch_size": config.argument("batch_size")}

@@ -161,6 +161,8 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     envs = _complete(config)
     root = get_dataset_path() if config.out is UNSET else config.out
     todo = [Dataset(config, env, kind, root) for env in envs for kind in config.kind]
+    if "replay" in config.kind:
+        console.print("loading PyTorch ...")
     for dataset in todo:
         if dataset.kind == "replay":
             _ = dataset.training  # raises before anything is written

@@ -221,10 +221,17 @@ def _evaluate_one(
     envs: TPMVectorEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
+    _say_without_bar(console, f"{spec}: {config.episodes:,} episodes")
     start = time.perf_counter()
     with bar(console, spec, config.episodes) as advance:
         records = run_episodes(envs, policy, config.episodes, config.seed, on_episodes=advance)
     return Result(spec, summarise(records), records, time.perf_counter() - start)
+
+
+def _say_without_bar(console: Console, text: str) -> None:
+    """Say what takes a while where no progress bar is shown."""
+    if not console.is_terminal:
+        console.print(f"{text} ...", markup=False, soft_wrap=True)
 
 
 @contextmanager
@@ -304,6 +311,7 @@ def _film(config: EvaluationConfig, console: Console) -> None:
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
+                _say_without_bar(console, f"drawing the {kind} {path}")
                 with bar(console, kind, episodes * frames) as advance:
                     write(path, partial(_play, envs, policy, episodes, config.seed, advance))
                 console.print(f"{kind}: {path}", markup=False)

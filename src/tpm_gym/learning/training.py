@@ -202,7 +202,8 @@ class _Session:
 
     def run(self) -> signal.Signals | None:
         """Train, save and test; return the signal that stopped the training, or None."""
-        config, listener = self.config, SignalListener()
+        config, content, listener = self.config, self.content, SignalListener()
+        self._say_title()
         torch.set_num_threads(config.threads)
         count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
         with ExitStack() as stack:
@@ -221,6 +222,9 @@ class _Session:
             called: list[BaseCallback] = [checkpointing, callbacks.Progress(advance), evaluation]
             if config.recipe.demonstrations:
                 called.insert(1, Demonstrations(**config.recipe.demonstrations))
+                if content is None:
+                    shown = f"{config.demonstrations:,} demonstrations of the expert"
+                    _say(self.console, f"playing {shown} and learning from them ...")
             with listener.listening():
                 stopped_by = self._learn(model, called, listener)
                 self._keep(run_folder.LAST_FILE, model)
@@ -229,6 +233,14 @@ class _Session:
         curve.draw_learning_curve(config.run / CURVE_FILE, config.title, evaluation.evaluations)
         self._conclude(stopped_by)
         return stopped_by
+
+    def _say_title(self) -> None:
+        config, content = self.config, self.content
+        start = f"from step {content.step if content else 0:,} to "
+        start = start if "resumed" in self.description else ""
+        _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
+        count, every = config.eval_episodes, config.eval_every
+        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
 
     def _begin(self, model: BaseAlgorithm) -> tuple[float, list[dict[str, Any]]]:
         """Set model, files and logs to the beginning or the checkpoint.
@@ -244,11 +256,6 @@ class _Session:
                 evaluations = run_folder.checked(content.files.get(EVALUATIONS_FILE, b""))
             training_state.restore_files(config.run, content)
         provenance.write_json(config.run / CONFIG_FILE, self.description)
-        start = f"from step {content.step if content else 0:,} to "
-        start = start if "resumed" in self.description else ""
-        _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
-        count, every = config.eval_episodes, config.eval_every
-        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
         iterations = max(0, model.num_timesteps - config.demonstrated) // config.rollout
         model.set_logger(training_state.make_logger(config.run, content, iterations))
         return seconds, evaluations

@@ -108,6 +108,7 @@ def tune(config: TuneConfig) -> Path:
     if folder.exists():
         raise ConfigError(f"--folder {folder}: exists; give another")
     shared = {name: getattr(config, name) for name in _SHARED}
+    print("loading PyTorch ...", flush=True)
     base = complete(TrainingConfig(**shared, test_episodes=0))
     check_seed(config.seed, base.envs + config.trials - 1)  # of the last training, too
     with closing(make_env(**base.env_arguments)):  # refuses an unknown machine or engine

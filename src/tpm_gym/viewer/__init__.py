@@ -5,6 +5,7 @@ The viewer needs the extra ``view``. Importing this package does not import vise
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,6 +54,7 @@ def open_viewer(
 def run(config: ViewConfig) -> None:
     """Run ``tpm-gym view``: serve until Ctrl-C, or export a page; errors as :func:`open_viewer`."""
     if config.export is not None:
+        print("playing an episode for the page ...", file=sys.stderr, flush=True)
         from tpm_gym.viewer.export import export
 
         print(export(config.export, config.machine))
