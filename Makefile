@@ -73,7 +73,7 @@ docs: $(INSTALLED) ## build the documentation in build/docs/html; warnings are e
 urdf: $(INSTALLED) ## regenerate urdf/ from the mechanism
 	$(RUN) -m tpm_gym.mechanism.export urdf
 
-pictures: $(INSTALLED) ## redraw the README's pictures
+pictures: $(INSTALLED) ## redraw the README's moving picture; half a minute
 	$(RUN) docs/draw_pictures.py
 
 figures: $(INSTALLED) ## redraw the paper's figures, and more, in docs/images/

@@ -368,7 +368,7 @@ LEARNING = (
     "steps to 95%, median",
     "seconds of CPU to 95%, median",
     "success in PyBullet, median (range), %",
-    "time with unsafe conditioning, mean, %",
+    "steps with unsafe conditioning, mean, %",
 )
 
 

@@ -46,7 +46,7 @@ def show_viewer(app: Any, page: str, text: list[str]) -> None:
     """Replace the picture in the source of the front page."""
     del app
     if page == "index" and (DOCS / _VIEWER).exists():
-        text[0], count = re.subn(r"!\[.*\]\(images/pick_and_place\.png\)", _FRAME, text[0])
+        text[0], count = re.subn(r"!\[.*\]\(images/pick_and_place\.gif\)", _FRAME, text[0])
         assert count == 1, "index.md has no such picture"
 
 

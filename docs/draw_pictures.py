@@ -1,4 +1,4 @@
-"""Draw the picture of the README: the published policy picking and placing, as a strip of frames.
+"""Draw the moving picture of the README: the published policy picks and places, in real time.
 
 python docs/draw_pictures.py
 """
@@ -9,46 +9,65 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from tpm_gym import load_policy  # registers the ids as well
-from tpm_gym.learning.film import contact_sheet
 from tpm_gym.simulation import Camera
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
 IMAGES = Path(__file__).resolve().parent / "images"
 ENV_ID = "TPMPickAndPlace-v0"
-START, GOAL = (-0.17, -0.034, 0.015), (0.06, -0.030, 0.130)
-FRAMES = {2: "approach", 6: "grip, by vacuum", 12: "carry", 14: "at the goal"}
-WIDTH, HEIGHT, SUPERSAMPLING = 400, 330, 3
-CAMERA = Camera((-0.05, -0.03, 0.105), 0.82, pitch=-16.0)
+EPISODES = (
+    ((-0.17, -0.034, 0.015), (0.06, -0.030, 0.130)),
+    ((0.08, -0.026, 0.015), (-0.20, -0.040, 0.100)),
+    ((-0.22, -0.041, 0.015), (0.08, -0.030, 0.190)),
+)
+"""Start of the block and goal of each episode, m."""
+WHOLE = Camera((0.02, 0.0, 0.49), 2.6, yaw=15.0, pitch=-10.0)
+CLOSE = Camera((-0.02, -0.03, 0.12), 0.95, pitch=-16.0)
+SIZE, SUPERSAMPLING, COLOURS = 400, 2, 128
+PAUSE = 900  # ms, at the end of an episode
 
 
-def frames() -> dict[str, NDArray[np.uint8]]:
-    """Render the steps of an episode that FRAMES names, with their captions."""
-    size = {"width": SUPERSAMPLING * WIDTH, "height": SUPERSAMPLING * HEIGHT}
-    env = gym.make(ENV_ID, render_mode="rgb_array", camera=CAMERA, **size)
-    observation, _ = env.reset(seed=0, options={"object": START, "goal": GOAL})
-    policy = load_policy(ENV_ID)
-    pictures = {}
-    for step in range(max(FRAMES) + 1):
-        if step in FRAMES:
-            picture = Image.fromarray(np.asarray(env.render()))
-            picture = picture.resize((WIDTH, HEIGHT), Image.Resampling.LANCZOS)
-            caption = f"{CONTROL_PERIOD * step:.2f} s: {FRAMES[step]}"
-            pictures[caption] = np.asarray(picture)
-        observation, *_ = env.step(policy.act(observation))
+def episodes(camera: Camera) -> list[list[Image.Image]]:
+    """Render all steps of each episode up to its success."""
+    side = SUPERSAMPLING * SIZE
+    env = gym.make(ENV_ID, render_mode="rgb_array", camera=camera, width=side, height=side)
+    policy, films = load_policy(ENV_ID), []
+    for start, goal in EPISODES:
+        observation, info = env.reset(seed=0, options={"object": start, "goal": goal})
+        film = [_frame(env)]
+        truncated = False
+        while not (info["is_success"] or truncated):
+            observation, _, _, truncated, info = env.step(policy.act(observation))
+            film.append(_frame(env))
+        films.append(film)
     env.close()
-    return pictures
+    return films
+
+
+def _frame(env: gym.Env[object, object]) -> Image.Image:
+    picture = Image.fromarray(np.asarray(env.render()))
+    return picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
 
 
 def main() -> None:
-    """Write docs/images/pick_and_place.png."""
-    IMAGES.mkdir(exist_ok=True)
-    path = IMAGES / "pick_and_place.png"
-    contact_sheet(frames(), columns=len(FRAMES)).save(path, optimize=True)
-    print(path)
+    """Write docs/images/pick_and_place.gif: the whole robot beside a close view."""
+    pictures, pauses = [], []
+    for pair in zip(episodes(WHOLE), episodes(CLOSE), strict=True):
+        for whole, close in zip(*pair, strict=True):
+            picture = Image.new("RGB", (2 * SIZE, SIZE))
+            picture.paste(whole)
+            picture.paste(close, (SIZE, 0))
+            pictures.append(picture)
+            pauses.append(round(1000 * CONTROL_PERIOD))
+        pauses[-1] = PAUSE
+    # One palette for all, so that colours do not flicker
+    palette = pictures[len(pictures) // 2].quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
+    frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in pictures]
+    path = IMAGES / "pick_and_place.gif"
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=pauses, loop=0)
+    print(f"{path}, {len(frames)} frames, {path.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -249,19 +250,24 @@ class Elapsed:
         """Do nothing: it is too late."""
 
 
-def test_a_long_wait_is_announced_once(folder, monkeypatch, caplog):
+def test_a_long_wait_is_announced_once_and_a_longer_one_again(folder, monkeypatch, caplog):
     # Neither other threads' turns nor loggers that libraries have changed decide what is seen.
     logger = logging.Logger("own")
     logger.addHandler(caplog.handler)
     monkeypatch.setattr(compiling, "_LOGGER", logger)
     monkeypatch.setattr(compiling.threading, "Timer", Elapsed)
-    monkeypatch.setattr(compiling._Cache, "_announced", False)
+    monkeypatch.setattr(compiling._Cache, "_announced", None)
     called()
     (folder / "own/scale.py").write_text("SCALE = 4.0\n")
     assert [called(), called()] == [(6.0, 0), (6.0, 1)]
     (message,) = caplog.messages
     assert message.startswith("compiling own.main.apply")
     assert str(folder / "kept") in message
+    later = time.monotonic() + compiling._PAUSE
+    monkeypatch.setattr(compiling.time, "monotonic", lambda: later)
+    (folder / "own/scale.py").write_text("SCALE = 5.0\n")
+    called()
+    assert caplog.messages[1:] == ["still compiling: now own.main.apply"]
 
 
 STAMPS = """

@@ -55,6 +55,12 @@ CASES: list[tuple[type[TPMError], tuple[Any, ...], type[Exception], str]] = [
         "(0, 1, 2) cannot be reached: it is 0.25 m outside; go elsewhere",
     ),
     (
+        UnreachableError,
+        ((0.0, 1.0, 2.0), "leg 3", -0.25, "go elsewhere", (4, 1)),
+        ValueError,
+        "(0, 1, 2) at index 4, 1 cannot be reached: leg 3 fails by 0.25 m; go elsewhere",
+    ),
+    (
         JointLimitError,
         ("R11", 2.5, -1.309, 2.0071286, "rad"),
         ValueError,

@@ -8,7 +8,14 @@ from typing import Any, Final
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, PercentFormatter
+from matplotlib.ticker import (
+    EngFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    PercentFormatter,
+    StrMethodFormatter,
+)
 
 from tpm_gym.learning.figure_style import (
     BLUE,
@@ -25,7 +32,7 @@ from tpm_gym.learning.figure_style import (
 )
 from tpm_gym.simulation.randomisation import LIMITS
 
-from .bisection import UNITS, ends, nominal
+from .bisection import UNITS, ends
 from .page import ENGINES, LEARNED, Frame, groups, split, successes
 from .records import Record
 
@@ -91,12 +98,12 @@ def learning_curves(runs: Frame) -> Figure:
 
 
 def penalty(runs: Frame) -> Figure:
-    """Draw success and time with unsafe conditioning, by penalty weight; a dot is a seed."""
+    """Draw success and steps with unsafe conditioning, by penalty weight; a dot is a seed."""
     ids = sorted(runs["env"].unique())
     figure, panels = _grid(ids, "Goals that tempt towards the singularity", 2.4)
     metrics = (
         ("success_at_end", "success, bar at the median", "median", BLUE),
-        ("unsafe_share", "time with unsafe conditioning, bar at the mean", "mean", VERMILLION),
+        ("unsafe_share", "steps with unsafe conditioning, bar at the mean", "mean", VERMILLION),
     )
     for env, axes in zip(ids, panels, strict=True):
         found = groups(runs[runs["env"] == env])
@@ -141,9 +148,15 @@ def robustness(bisections: Sequence[Record]) -> Figure:
         axes.set_xlabel(UNITS.get(attribute, "factor, logarithmic"))
         if attribute not in UNITS:
             axes.set_xscale("log")
-        ticks = sorted([nominal(attribute), *ends(attribute)])
-        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        axes.minorticks_off()
+            low, high = ends(attribute)
+            parts = (1, 2, 5) if high <= 100 * low else (1, 3)
+            axes.xaxis.set_major_locator(LogLocator(subs=parts))
+            axes.xaxis.set_minor_locator(LogLocator(subs=range(1, 10)))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        else:
+            most = 6 if max(ends(attribute)) >= 1 else 5  # small numbers have long labels
+            axes.xaxis.set_major_locator(MaxNLocator(most, steps=(1, 2, 5, 10)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     _legend(figure, "each dot is a test; success halves near the dashed lines")
     return figure
 

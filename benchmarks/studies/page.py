@@ -289,7 +289,7 @@ def _runs_table(runs: Frame) -> Frame:
             "minutes in all": f"{run['minutes']:.1f}",
             "minutes of CPU": _cell(run["cpu_minutes"], "{:.1f}"),
             "smallest conditioning": _cell(run["pybullet.conditioning_min.worst"], "{:.3f}"),
-            "time with unsafe conditioning": _cell(run["pybullet.unsafe_share.mean"], "{:.1%}"),
+            "steps with unsafe conditioning": _cell(run["pybullet.unsafe_share.mean"], "{:.1%}"),
             "return": _cell(run["pybullet.return.mean"], "{:.2f}"),
         }
         for group in groups(runs)
@@ -308,7 +308,7 @@ def _penalty_table(runs: Frame) -> Frame:
             "penalty weight": f"{first.penalty_weight:g}",
             **_successes(group),
             "return": _cell(group["pybullet.return.mean"].mean(), "{:.2f}"),
-            "time with unsafe conditioning (range of seeds)": _cell(
+            "steps with unsafe conditioning (range of seeds)": _cell(
                 unsafe.mean(), "{:.1%}" + spread
             ),
             "smallest conditioning": _cell(
@@ -321,7 +321,7 @@ def _penalty_table(runs: Frame) -> Frame:
 
 
 def _compared(runs: Frame) -> list[str]:
-    """Return a line for each id and method: time with unsafe conditioning, by penalty."""
+    """Return a line for each id and method: steps with unsafe conditioning, by penalty."""
     shares = runs.groupby(["env", "label", "penalty_weight"])["pybullet.unsafe_share.mean"].mean()
     shares = shares.unstack().reindex(columns=[0.0, 1.0]).dropna()
     return [

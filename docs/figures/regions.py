@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from string import ascii_uppercase
 
 import numpy as np
 from clearance import clear_of_links
@@ -151,28 +152,28 @@ def _stop_margin(points: FloatArray) -> FloatArray:
 
 
 def _legend(figure: Figure, half: Sequence[Aspect]) -> None:
-    """Write a table of the aspects beside the sections."""
-    handles: list[Patch | Line2D] = [Patch(facecolor="none", label="      dm³ stops links")]
+    """Write a table of the aspects, with letters, beside the sections."""
+    handles: list[Patch | Line2D] = [Patch(facecolor="none", label="  234   dm³ stops links")]
     seen: set[Signs] = set()
     allowed = np.zeros(3)  # volume, within the stops, and clear of links as well; dm^3
-    for aspect in half:
+    for letter, aspect in zip(ascii_uppercase, half, strict=False):
         parts = _allowed(aspect)
         allowed += parts
         signs = signs_of(aspect)
         marks = "".join("+" if sign > 0 else "\N{MINUS SIGN}" for sign in signs)
         patch = Patch(facecolor=colour(signs, signs in seen), edgecolor="0.4", linewidth=0.4)
         seen.add(signs)  # the larger of two comes first
-        patch.set_label(_row(marks, parts))
+        patch.set_label(_row(f"{letter} {marks}", parts))
         handles.append(patch)
-    handles.append(Patch(facecolor="none", label=_row("all", allowed)))
+    handles.append(Patch(facecolor="none", label=_row("  all", allowed)))
     handles.append(Line2D([], [], color="white", linewidth=1.6, linestyle="--"))
     handles[-1].set_label("motors' stops")
     font = {"family": "monospace", "size": 6.5}
     legend = figure.legend(
-        handles=handles, loc="upper left", bbox_to_anchor=(0.752, 0.9), prop=font
+        handles=handles, loc="upper left", bbox_to_anchor=(0.748, 0.9), prop=font, handlelength=1.5
     )
     legend.get_frame().set_facecolor("0.88")
-    title = "y > 0; y < 0 is its mirror image"
+    title = "Regions A to H for y > 0, and\nthe signs of factors 2, 3 and 4"
     legend.set_title(title)
     legend.get_title().set_fontsize(7.0)
 

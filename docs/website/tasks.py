@@ -1,5 +1,7 @@
 """A page for each registered task, from its class, its spaces, its expert and the records.
 
+docs/task-sheets.md has what a reader needs without a build; ``make docs`` writes it too.
+
 ``tpm_task_modules`` in conf.py names further modules to import, which register tasks of their own.
 """
 
@@ -35,6 +37,7 @@ from tpm_gym.tasks.task import Task
 from website.projects import GENERATED, ROOT, write
 
 PAGES = GENERATED / "tasks"
+SHEETS = ROOT / "docs" / "task-sheets.md"
 EPISODES = 200
 """Episodes of the expert in each id."""
 WIDTH, HEIGHT = 480, 360
@@ -58,7 +61,7 @@ def write_pages(modules: Sequence[str] = ()) -> None:
         _draw_film(name)
         _draw_curves(name)
         write(PAGES / f"{name}.md", "\n".join(page(name)))
-    write(GENERATED / "tasks.txt", "\n".join(summary()))
+    write(SHEETS, "\n".join(sheets()))
     for old in PAGES.glob("*"):
         if not any(old.name.startswith(f"{name}.") or old.stem == name for name in TASKS):
             old.unlink()
@@ -82,15 +85,33 @@ def page(name: str) -> Iterator[str]:
     yield from _action(task)
     yield from _observation(task)
     yield from _reward(tasks)
+    yield from _events(task)
     yield from _expert(ids)
     yield from _learning(name)
 
 
-def summary() -> Iterator[str]:
-    """Yield a line of a list for each task: a link to its page, and its first sentence."""
-    for name in sorted(TASKS):
-        first = _sentences(TASKS[name])[0]
-        yield f"- [{_title(name)}](generated/tasks/{name}.md): {first}"
+def sheets() -> Iterator[str]:
+    """Yield the lines of the page with observation, reward and events of the package's tasks."""
+    yield from (
+        "# Observation, reward and success of each task",
+        "",
+        "`make docs` writes this page from the classes of [the tasks](../src/tpm_gym/tasks). "
+        "Numbers are of the paper's machine; goals and entries are in the world frame. "
+        "`help(tpm_gym.TPMEnv)` explains actions, frames and `info`.",
+        "",
+        "An observation is a dictionary of `achieved_goal`, `desired_goal` and `observation`, a "
+        "vector that has the entries of these tables. An entry is stored as "
+        "(value - centre) / scale; `env.unwrapped.task.decode` inverts that. "
+        'The reward is the sum of the terms, `info["reward_terms"]`.',
+        "",
+    )
+    for name in sorted(name for name in TASKS if TASKS[name].__module__.startswith("tpm_gym.")):
+        tasks = {env_id: _task(env_id) for env_id in ids_of(name) if "Joints" not in env_id}
+        task = next(iter(tasks.values()))
+        yield from (f"## {_title(name)}", "", _sentences(TASKS[name])[0], "")
+        yield f"Ids: {', '.join(f'`{env_id}`' for env_id in ids_of(name))}."
+        yield from ("", f"{_goal(task)} `observation` has {task.observation_size} numbers:", "")
+        yield from (*_entries(task), *_terms_of_reward(tasks), _success(task), "", *_events(task))
 
 
 def ids_of(name: str) -> list[str]:
@@ -141,16 +162,19 @@ def _ids(tasks: dict[str, Task]) -> Iterator[str]:
 
 
 def _scene(task: Task) -> Iterator[str]:
-    goals = f"A goal has {task.goal_size} numbers: the world coordinates in m of " + (
-        "one point" if task.goal_size == 3 else f"{task.goal_size // 3} points"
-    )
-    yield from ("## Scene", "", f"{goals}. Samplings of goals: {_code(task.samplings)}.", "")
+    goals = f"{_goal(task)} Samplings of goals: {_code(task.samplings)}."
+    yield from ("## Scene", "", goals, "")
     if task.scene.objects:
         yield from ("| object | width | height | mass |", "| --- | --- | --- | --- |")
         for block in task.scene.objects:
             width, height = (f"{1e3 * length:g} mm" for length in (block.width, block.height))
             yield f"| `{block.name}` | {width} | {height} | {1e3 * block.mass:g} g |"
         yield ""
+
+
+def _goal(task: Task) -> str:
+    points = "one point" if task.goal_size == 3 else f"{task.goal_size // 3} points"
+    return f"A goal has {task.goal_size} numbers: the world coordinates in m of {points}."
 
 
 def _action(task: Task) -> Iterator[str]:
@@ -177,6 +201,12 @@ def _observation(task: Task) -> Iterator[str]:
         f"frame, and `observation`, ({task.observation_size},), which has these entries. Each is "
         "stored as (value - centre) / scale; `env.unwrapped.task.decode` inverts that.",
         "",
+    )
+    yield from _entries(task)
+
+
+def _entries(task: Task) -> Iterator[str]:
+    yield from (
         "| entry | size | unit | meaning | centre | scale |",
         "| --- | --- | --- | --- | --- | --- |",
     )
@@ -189,31 +219,53 @@ def _observation(task: Task) -> Iterator[str]:
 
 
 def _reward(tasks: dict[str, Task]) -> Iterator[str]:
-    yield from (
-        "## Reward",
-        "",
-        "The reward is the sum of these terms, `info['reward_terms']`:",
-        "",
-    )
+    yield from ("## Reward", "")
+    yield from ("The reward is the sum of these terms, `info['reward_terms']`:", "")
+    yield from _terms_of_reward(tasks)
+    yield from (_success(next(iter(tasks.values()))), "")
+
+
+def _terms_of_reward(tasks: dict[str, Task]) -> Iterator[str]:
     yield from ("| term | ids | value |", "| --- | --- | --- |")
     sparse, dense = ([i for i, t in tasks.items() if t.reward == r] for r in ("sparse", "dense"))
     task = tasks[sparse[0]]
     within = f"{1e3 * task.tolerance:g} mm"
-    yield f"| `goal` | sparse | 0 if the distance to the goal is below {within}, else -1 |"
+    yield f"| `goal` | sparse | 0 if the distance to the goal (gap) is below {within}, else -1 |"
     own = type(task).goal_term is not Task.goal_term
-    more = ". " + " ".join(_sentences(type(task).goal_term)).removesuffix(".") if own else ""
-    yield f"| `goal` | dense | minus the distance to the goal, in units of 0.1 m{more} |"
+    distance = "minus the distance to the goal (gap) / 0.1 m"
+    yield f"| `goal` | dense | {_result(type(task).goal_term) if own else distance} |"
     safe = f"{task.machine.safe_conditioning:g}"
     yield (
-        f"| `singularity` | all | -(1 - (c / {safe})^4) if the conditioning c = 1/cond(J) is below "
-        f"{safe}, else 0 |"
+        f"| `singularity` | all | -`penalty_weight` x (1 - (c / {safe})^4) if the conditioning "
+        f"c = 1/cond(J) is below {safe}, else 0; -`penalty_weight` after a change of mode |"
     )
-    shaped = " ".join(_sentences(type(task).shaping)).removesuffix(".")
+    always = _terms(sparse[0])
     for term in _terms(dense[0]):
         if term not in ("goal", "singularity"):
-            which = "all" if term in _terms(sparse[0]) else "dense"
-            yield f"| `{term}` | {which} | {shaped.removeprefix('Return ').split('.')[0]} |"
+            which = "all" if term in always else "dense"
+            yield f"| `{term}` | {which} | {_result(type(task).shaping)} |"
     yield ""
+
+
+def _success(task: Task) -> str:
+    """Return a sentence on success, with the words of the task for a distance of its own."""
+    own = type(task).gap is not Task.gap
+    distance = _result(type(task).gap) if own else "the distance to the goal"
+    return f'Success, `info["is_success"]`: {distance} is below {1e3 * task.tolerance:g} mm.'
+
+
+def _events(task: Task) -> Iterator[str]:
+    """Yield the task's own entries of ``info``, if it has any."""
+    if task.events:
+        yield from ("| event in `info` | meaning |", "| --- | --- |")
+        yield from (f"| `{e}` | {_result(getattr(type(task), e))} |" for e in task.events)
+        yield ""
+
+
+def _result(function: Any) -> str:
+    """Return what a function returns, in the words of its docstring."""
+    text = " ".join(line for line in _sentences(function) if line)
+    return re.sub(r", \((n|\.\.\.),\)( m)?", "", text).removeprefix("Return ").removesuffix(".")
 
 
 def _terms(env_id: str) -> list[str]:

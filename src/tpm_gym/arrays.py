@@ -8,12 +8,12 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from numbers import Real
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.errors import InputError, TPMError
+from tpm_gym.errors import InputError, TPMError, UnreachableError
 from tpm_gym.errors import brief as brief
 
 FloatArray = NDArray[np.float64]
@@ -24,6 +24,7 @@ Quaternion = tuple[float, float, float, float]
 """Quaternion (x, y, z, w)."""
 
 _Error = Callable[[str, Any, str], TPMError]
+_Explained = TypeVar("_Explained", bound=TPMError)
 
 
 def numbers(name: str, value: ArrayLike, error: _Error = InputError) -> FloatArray:
@@ -119,10 +120,19 @@ def finite_points(name: str, value: ArrayLike) -> FloatArray:
     return array
 
 
-def first_row(points: FloatArray, chosen: BoolArray) -> Vector:
-    """Return the first of ``points`` (..., 3) for which ``chosen`` (...,) is true, as floats."""
+def explained(
+    explain: Callable[[Vector], _Explained], points: FloatArray, chosen: BoolArray
+) -> _Explained:
+    """Return the error of the first of ``points`` (..., 3) for which ``chosen`` (...,) is true.
+
+    ``explain`` returns the error of a point. If there are several points, an UnreachableError gets
+    the index of this point.
+    """
     x, y, z = points[chosen][0].tolist()
-    return x, y, z
+    error = explain((x, y, z))
+    if isinstance(error, UnreachableError):
+        error.index = tuple(np.argwhere(chosen.tolist())[0].tolist())
+    return error
 
 
 def is_tensor(value: object) -> bool:

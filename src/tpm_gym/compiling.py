@@ -11,6 +11,7 @@ import inspect
 import logging
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -30,6 +31,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _CACHING: Any = caching
 PATIENCE: Final = 1.0
 """Time after which a message says that functions are being compiled, s."""
+_PAUSE: Final = 10.0
+"""Least time between two such messages, s."""
 _LOGGER: Final = logging.getLogger("tpm_gym")
 
 
@@ -95,7 +98,7 @@ class _Disk(_CACHING.FunctionCache):  # type: ignore[misc]
 class _Cache:
     """Cache of a function's machine code, renewed if its source code changes; never raises."""
 
-    _announced = False
+    _announced: float | None = None  # time of the last message
 
     def __init__(self, function: Callable[..., Any]) -> None:
         """Find a folder that can be written."""
@@ -137,9 +140,13 @@ class _Cache:
             self._disk.save_overload(sig, data)
 
     def _announce(self) -> None:
-        if _Cache._announced:
+        last, now = _Cache._announced, time.monotonic()
+        if last is not None and now - last < _PAUSE:
             return
-        _Cache._announced = True
+        _Cache._announced = now
+        if last is not None:
+            _LOGGER.warning("still compiling: now %s", self._label)
+            return
         where = (
             f"once; the machine code is kept in {self.cache_path}"
             if self.cache_path

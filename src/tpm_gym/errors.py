@@ -83,12 +83,13 @@ class EpisodeError(TPMError, RuntimeError):
 
 @dataclass(eq=False)
 class UnreachableError(TPMError, ValueError):
-    """The kinematics have no solution for the input on the requested branch."""
+    """The kinematics have no solution for the input in the requested mode."""
 
     point: Sequence[float]  # m, or joint angles, rad
     leg: str  # what fails: "beta", "leg 1" ..., or "box" for the task's region
     margin: float  # by how much, m; negative
     hint: str
+    index: tuple[int, ...] = ()  # of the point in the array; empty for a single point
 
     def __post_init__(self) -> None:
         """Convert the numbers to plain floats."""
@@ -100,7 +101,8 @@ class UnreachableError(TPMError, ValueError):
         shown = ", ".join(f"{value:.4g}" for value in self.point)
         far = f"{-self.margin:.4g} m"
         reason = f"it is {far} outside" if self.leg == "box" else f"{self.leg} fails by {far}"
-        return f"({shown}) cannot be reached: {reason}; {self.hint}"
+        row = f" at index {', '.join(map(str, self.index))}" if self.index else ""
+        return f"({shown}){row} cannot be reached: {reason}; {self.hint}"
 
 
 @dataclass(eq=False)

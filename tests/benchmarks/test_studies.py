@@ -24,7 +24,7 @@ from processes import PYTHON, signalled
 from studies import benchmark
 from studies.__main__ import main
 from studies.bisection import ends, halving, nominal
-from studies.figures import learning_curves, penalty
+from studies.figures import learning_curves, penalty, robustness
 from studies.page import BENCHMARK, ENGINES, PAGE, RUNS, Write, every_run, page, split, write
 from studies.plan import Bisection, Run, Study, plan_runs
 from studies.records import RECORDS, Collect, collect, condense, read_records
@@ -369,6 +369,17 @@ def test_runs_that_differ_are_told_apart_everywhere(other, labels):
     assert [line.get_label() for line in curves.axes[0].lines[:2]] == labels
     ticks = [t.get_text() for t in penalty(split(weighted)[1]).axes[0].get_xticklabels()]
     assert len(set(ticks)) == 4
+
+
+def test_where_success_halves_can_be_read_from_the_axes_of_robustness():
+    records = [record for record in read_records(ROOT / RECORDS) if "attribute" in record]
+    panels = [axes for axes in robustness(records).axes if axes.get_visible()]
+    assert len(panels) == 10
+    for axes in panels:
+        low, high = axes.get_xlim()
+        ticks = [tick for tick in axes.get_xticks() if low <= tick <= high]
+        steady = {line.get_ydata().min() > 0.5 for line in axes.lines[:-1]} == {True}
+        assert len(ticks) >= (3 if steady else 5), axes.get_title()
 
 
 # -- the benchmark --------------------------------------------------------------------------------

@@ -57,6 +57,12 @@ def assert_same(one: Any, other: Any) -> None:
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.fixture
+def threads_for_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let threads step few environments too, which is slow, but quick to test."""
+    monkeypatch.setattr("tpm_gym.envs.vector._FEWEST", 1)
+
+
 @pytest.mark.parametrize(
     ("env_id", "options"),
     [
@@ -121,6 +127,7 @@ def test_it_does_what_gymnasiums_vectors_of_single_environments_do(mode):
 
 
 @pytest.mark.parametrize(("mode", "drive"), [*zip(MODES, ["ideal", "servo", "ideal"], strict=True)])
+@pytest.mark.usefixtures("threads_for_few")
 def test_threads_change_no_bit(mode, drive):
     options = {"randomisation": EVERYTHING, "drive": drive, "max_episode_steps": 7, "stagger": True}
     runs = []
@@ -132,6 +139,7 @@ def test_threads_change_no_bit(mode, drive):
             if mode == "Disabled" and found[-1][3].any():
                 found.append(envs.reset(options={"reset_mask": found[-1][3]}))
         moment = envs.save_state()
+        assert len(moment) == threads
         found.append((envs.step(actions), bits(vars(envs.state)), envs.goal))
         envs.restore_state(moment)
         found.append((envs.step(actions), bits(vars(envs.state)), envs.goal))
@@ -190,6 +198,16 @@ def test_what_is_saved_goes_on_equally(randomisation):
             assert_same(again.step(actions)[0], wanted[0])
 
 
+@pytest.mark.parametrize(("count", "threads"), [(6, 1), (2047, 1), (2048, 2), (2049, 2)])
+def test_threads_have_as_many_environments_as_are_worth_it(count, threads):
+    envs, alone = (make(PICK, count, num_threads=number) for number in (64, 1))
+    assert_same(*(each.reset(seed=0) for each in (envs, alone)))
+    assert len(envs.save_state()) == threads
+    actions = actions_of(envs, 1)[0]
+    assert_same(*(each.step(actions) for each in (envs, alone)))
+
+
+@pytest.mark.usefixtures("threads_for_few")
 def test_copies_step_in_threads_of_their_own():
     before = threading.enumerate()
     envs = make(PICK, 6, num_threads=2)
@@ -206,6 +224,7 @@ def test_copies_step_in_threads_of_their_own():
     assert set(threading.enumerate()) <= set(before)
 
 
+@pytest.mark.usefixtures("threads_for_few")
 def test_refused_snapshots_change_nothing():
     envs, alone = make(PICK, 6, num_threads=2), gym.make(PICK, engine="analytic")
     single = make(PICK, 1)
@@ -325,6 +344,7 @@ def test_a_refused_reset_seeds_nothing(wrong):
     assert_same(*found)
 
 
+@pytest.mark.usefixtures("threads_for_few")
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_refused_first_reset_of_some_starts_nothing(threads):
     envs = make(PICK, 4, num_threads=threads)

@@ -14,6 +14,7 @@ from tpm_gym.envs.testing import check_env
 from tpm_gym.errors import ConfigurationError, ResetOptionError, UnreachableError
 from tpm_gym.mechanism import PAPER_TPM
 from tpm_gym.simulation import Block, Scene
+from tpm_gym.tasks import Motion, hanging
 from tpm_gym.tasks.task import Entry
 
 
@@ -90,6 +91,30 @@ def test_a_block_that_the_cup_cannot_come_down_to_is_refused(sorting):
         Coin(PAPER_TPM)
     with pytest.raises(ConfigurationError, match="a name of its own"):
         Scene((Block(), Block()), markers=2)
+
+
+def test_a_name_instead_of_a_block_is_refused(sorting):
+    task, moves = sorting.Sort(PAPER_TPM), Motion(PAPER_TPM, None)
+    for use in (hanging, task.on_table, lambda block: next(moves.pick(block, 0.03))):
+        with pytest.raises(ConfigurationError, match=r"block = 'red' .*Block, not its name"):
+            use("red")
+
+
+def test_goals_outside_the_observation_space_are_refused(sorting):
+    class Astray(sorting.Sort):
+        far = 0.0
+
+        def sample(self, rngs, chosen):
+            starts = super().sample(rngs, chosen)
+            return {**starts, "goal": starts["goal"] + self.far}
+
+    env = tpm_gym.TPMEnv(Astray, engine="analytic")
+    env.reset(seed=0)
+    env.task.far = 5.0
+    with pytest.raises(ConfigurationError, match=r"sample\(\)\['goal'\] = .*-2 to 2 m"):
+        env.reset(seed=0)
+    env.task.far = 0.0
+    env.reset(seed=0)
 
 
 def event(name, happens):

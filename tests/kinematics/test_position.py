@@ -13,6 +13,7 @@ from tpm_gym.errors import InputError, UnreachableError
 from tpm_gym.kinematics import (
     ASSEMBLY_MODES,
     WORKING_MODES,
+    AssemblyMode,
     forward,
     forward_all,
     inverse,
@@ -20,6 +21,7 @@ from tpm_gym.kinematics import (
     jacobian,
 )
 from tpm_gym.kinematics.geometry import PAPER, Geometry
+from tpm_gym.kinematics.workspace import assembly_of
 from tpm_gym.mechanism import PAPER_TPM
 
 POINT_TOLERANCE = 1e-9
@@ -93,6 +95,33 @@ def test_angles_are_returned_in_the_ranges_that_are_promised():
     for angle in (theta1, theta3, found.beta):
         assert (angle > -np.pi).all()
         assert (angle <= np.pi).all()
+
+
+def test_the_assembly_mode_of_a_point_gives_the_point_back_and_the_default_its_mirror_image():
+    point = np.array([0.0, -0.03, 0.8])
+    theta = inverse(point)
+    mode = ASSEMBLY_MODES[assembly_of(point)]
+    assert mode == AssemblyMode(-1, -1)
+    np.testing.assert_allclose(forward(theta, mode), point, atol=1e-12)
+    np.testing.assert_allclose(forward(theta), point * (1, -1, 1), atol=1e-12)
+
+
+@pytest.mark.parametrize("tensor", [False, True])
+def test_an_error_names_the_index_of_the_point_and_the_mode(tensor):
+    path = np.tile([0.0, 0.03, 0.8], (5, 1))
+    angles = inverse(path)
+    path[3, 2], angles[3] = 3.0, 0.0
+    for solve, wrong, mode in ((inverse, path, "WorkingMode"), (forward, angles, "AssemblyMode")):
+        given = torch.tensor(wrong) if tensor else wrong
+        with pytest.raises(UnreachableError, match=r"at index 3 cannot be reached") as caught:
+            solve(given)
+        assert caught.value.index == (3,)
+        assert f"{mode}(" in caught.value.hint
+        assert "branch" not in caught.value.hint
+        with pytest.raises(UnreachableError, match=r"at index 1, 0 cannot") as caught:
+            solve(given[2:4, None])
+        with pytest.raises(UnreachableError, match=r"\) cannot be reached"):
+            solve(given[3])
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (2, 3), (0,)])

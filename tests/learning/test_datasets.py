@@ -168,7 +168,11 @@ def test_datasets_of_two_engines_have_two_names(engine):
         ("--noise inf: must be finite", {"noise": float("inf")}),
         ("--env: give at least one", {"env": ()}),
         ("--kind: give at least one", {"kind": ()}),
-        ("--seed 999999: must be at most 999988", {"seed": 999_999}),
+        ("--seed 999999: must lie in 0 ... 999988", {"seed": 999_999}),
+        (
+            "--steps 4000: must be more than the 11,200 of the .*; give more --steps, or .* train$",
+            {"env": ("TPMPickAndPlace-v0",), "kind": ("replay",), "steps": 4000},
+        ),
         ("--seed 999900: must lie in 0", {"seed": 999_900, "kind": ("random", "replay")}),
     ],
 )

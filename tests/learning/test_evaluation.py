@@ -127,6 +127,8 @@ def test_video_shows_the_first_episodes(episodes, shown, short, tmp_path):
     assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 25
     assert [entry.name for entry in path.parent.iterdir()] == ["expert.mp4"]
     assert f"video: {path}\n" in said(console)
+    waits = [line for line in said(console).splitlines() if line.endswith("...")]
+    assert waits == [f"expert: {episodes} episodes ...", f"drawing the video {path} ..."]
 
 
 @pytest.mark.parametrize(

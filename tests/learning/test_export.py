@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,17 @@ import torch
 from gymnasium import spaces
 from processes import TPM_GYM, error_of
 from sb3_contrib import TQC
-from stable_baselines3 import DDPG, PPO, SAC
+from stable_baselines3 import A2C, DDPG, PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import tpm_gym
-from tpm_gym.learning import GoalGapExtractor, export
+from tpm_gym import learning
+from tpm_gym.learning import GoalGapExtractor, export, save_policy
 from tpm_gym.learning.command_line import main
-from tpm_gym.learning.errors import PolicyError
+from tpm_gym.learning.configuration import EnvOptions
+from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.policy.files import read_description
 
 RECIPE = {"n_timesteps": 5000, "arguments": {"gamma": 0.95, "policy_kwargs": {"net_arch": [8]}}}
@@ -269,6 +272,14 @@ def test_what_is_converted_says_what_the_run_says(run, model, capsys):
     assert about.versions == {"torch": "2.0.0", "tpm_gym": None}
 
 
+def test_the_command_says_what_it_does_before_pytorch_is_loaded(run, capsys, monkeypatch):
+    monkeypatch.delattr(learning, "export")
+    monkeypatch.setitem(sys.modules, "tpm_gym.learning.export", None)
+    with pytest.raises(ImportError):
+        main(["export", str(run), str(run / "out")])
+    assert capsys.readouterr().out.startswith(f"exporting {run} ")
+
+
 def test_the_command_line_does_not_touch_what_is_not_trusted(run):
     """In a process of its own, with a file that would leave a trace if it were unpickled."""
     trace = run / "trace"
@@ -294,20 +305,30 @@ class Trace:
     ("words", "message"),
     [
         (["none.zip", "out"], "no such file"),
+        (["empty", "out"], "empty: holds no best.json or last.json; give the .zip of a model"),
+        (["best.zip", "out", "--env", "TPMReach-v0"], "--env TPMReach-v0: .* leave it out"),
+        (["best.zip", "out", "--machine", "wide"], "--machine wide: .* leave it out"),
         (["best.zip", "out.zip"], "not for a .zip"),
         (["broken.zip", "out"], "cannot be loaded as sac"),
-        (["elsewhere/best.zip", "out"], "no config.json of a training"),
+        (["elsewhere/best.zip", "out"], "no config.json of a training.* give .* --env ID"),
+        (["elsewhere/best.zip", "out", "--env", "TPMReech-v0"], "unknown environment"),
+        (
+            ["elsewhere/broken.zip", "out", "--env", "TPMReach-v0"],
+            "is no archive of Stable-B.* zip",
+        ),
         (["best.zip", "/proc/out"], "OUT /proc/out: cannot be written"),
     ],
 )
 def test_mistakes_on_the_command_line_are_one_line(run, words, message):
     (run / "broken.zip").write_bytes(b"PK")
+    (run / "empty").mkdir()
     away = run.parent / "a" / "b" / "elsewhere"
     away.mkdir(parents=True)
-    (away / "best.zip").write_bytes((run / "best.zip").read_bytes())
-    model = away / "best.zip" if "elsewhere" in words[0] else run / words[0]
+    for name in ("best.zip", "broken.zip"):
+        (away / name).write_bytes((run / name).read_bytes())
+    model = away / Path(words[0]).name if "elsewhere" in words[0] else run / words[0]
     with pytest.raises(SystemExit, match=message) as caught:
-        main(["export", str(model), str(run / words[1]), "--trust-pickle"])
+        main(["export", str(model), str(run / words[1]), "--trust-pickle", *words[2:]])
     assert "\n" not in str(caught.value)
 
 
@@ -340,3 +361,85 @@ def test_files_that_are_no_policy_are_neither_replaced_nor_removed(run):
             main(["export", str(run / "best.zip"), str(run / out), "--trust-pickle"])
         export.remove(run / out)
     assert {file: file.read_bytes() for file in run.iterdir()} == before
+
+
+def test_the_folder_of_a_run_is_exported_as_it_is_evaluated(run, model):
+    save(model, run / "last")
+    main(["export", str(run), str(run / "copy")])
+    assert (run / "copy.json").read_bytes() == (run / "last.json").read_bytes()
+    model.num_timesteps = 7
+    save(model, run / "best")
+    main(["export", str(run), str(run / "copy")])
+    assert tpm_gym.load_policy(run / "copy").description.steps == 7
+
+
+# -- models that tpm_gym has not trained ----------------------------------------------------------
+
+REACH = ("--env", "TPMReach-v0", "--engine", "analytic")
+
+
+@pytest.fixture(scope="module")
+def reach():
+    with gym.make("TPMReach-v0", engine="analytic") as env:
+        yield env
+
+
+def in_reach(reach: gym.Env[Any, Any]) -> Blank:
+    return Blank(reach.action_space, **reach.observation_space.spaces)
+
+
+@pytest.mark.parametrize("kind", [SAC, TQC, PPO])
+def test_a_model_without_a_run_is_exported_for_the_environment_that_one_names(
+    tmp_path, reach, kind, capsys
+):
+    made = make(kind, in_reach(reach), net_arch=[8], **GOAL_GAP)
+    made.save(tmp_path / "v.zip")
+    out = tmp_path / "v"
+    main(["export", str(tmp_path / "v.zip"), str(out), "--trust-pickle", *REACH])
+    loaded = tpm_gym.load_policy(out)
+    about = loaded.description
+    assert (about.env_id, about.algorithm, about.seed) == ("TPMReach-v0", kind.__name__.lower(), 0)
+    assert about.env_options == {"engine": "analytic"}
+    batch = observations(reach, 10)
+    expected, _ = made.predict(batch, deterministic=True)
+    np.testing.assert_allclose(loaded.act(batch), expected, atol=1e-5)
+    main(["evaluate", "--policy", str(out), "--engine", "analytic", "--episodes", "1"])
+    assert "success at end" in capsys.readouterr().out
+
+
+def test_a_model_in_memory_is_saved_with_what_it_was_trained_in(tmp_path, reach):
+    made = make(SAC, in_reach(reach), net_arch=[8])
+    options = EnvOptions(engine="analytic", machine="wide")
+    path = save_policy(made, str(tmp_path / "p"), env_id="TPMReach-v0", env_options=options)
+    about = tpm_gym.load_policy(path).description
+    assert about.env_options == {"engine": "analytic", "machine": "wide"}
+
+
+def test_a_model_of_another_environment_is_refused(tmp_path, model):
+    options = EnvOptions(engine="analytic")
+    for env_id, space in (("TPMReach-v0", "action"), ("TPMPickAndPlace-v0", "observation")):
+        with pytest.raises(PolicyError, match=f"model has the {space} space .* {env_id} has "):
+            save_policy(model, tmp_path / "p", env_id=env_id, env_options=options)
+    model.save(tmp_path / "v.zip")
+    with pytest.raises(SystemExit, match="give the environment id of its training"):
+        main(["export", str(tmp_path / "v.zip"), str(tmp_path / "p"), "--trust-pickle", *REACH])
+    with pytest.raises(ConfigError, match="unknown environment 'TPMReech-v0'"):
+        save_policy(model, tmp_path / "p", env_id="TPMReech-v0")
+    assert [file.name for file in tmp_path.iterdir()] == ["v.zip"]
+
+
+@pytest.mark.parametrize("kind", [A2C, DDPG])
+def test_a_model_of_an_algorithm_that_cannot_be_exported_is_refused(tmp_path, reach, kind):
+    options: dict[str, Any] = {} if kind is A2C else {"buffer_size": 10}
+    kind("MultiInputPolicy", in_reach(reach), **options).save(tmp_path / "v.zip")
+    with pytest.raises(SystemExit, match="algorithm that is none of sac, tqc, ppo"):
+        main(["export", str(tmp_path / "v.zip"), str(tmp_path / "p"), "--trust-pickle", *REACH])
+
+
+@pytest.mark.parametrize("folder", [".", "TPMReach-v0"])  # the zoo's is the second
+def test_a_model_that_acts_on_normalised_observations_is_refused(tmp_path, reach, folder):
+    make(PPO, in_reach(reach)).save(tmp_path / "v.zip")
+    (tmp_path / folder).mkdir(exist_ok=True)
+    (tmp_path / folder / "vecnormalize.pkl").touch()
+    with pytest.raises(SystemExit, match="normalised observations"):
+        main(["export", str(tmp_path / "v.zip"), str(tmp_path / "p"), "--trust-pickle", *REACH])

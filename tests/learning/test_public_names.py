@@ -26,6 +26,24 @@ def test_every_command_has_its_help(command, capsys):
     assert len(shown.splitlines()) < 75
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "--env", "TPMReech-v0"],
+        ["resume", "nowhere"],
+        ["collect", "--env", "TPMReach-v0", "--kind", "replay", "--steps", "1"],
+        ["tune", "--env", "TPMReech-v0"],
+    ],
+)
+def test_a_command_says_that_it_loads_pytorch(words, capsys, tmp_path, monkeypatch):
+    if words[0] in (needed := {"collect": "minari", "tune": "ray"}):
+        pytest.importorskip(needed[words[0]])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="error: "):
+        main(words)
+    assert capsys.readouterr().out == "loading PyTorch ...\n"
+
+
 def test_one_root_catches_every_error():
     kinds = [kind for kind in vars(errors).values() if isinstance(kind, type)]
     assert len(kinds) > 5

@@ -274,6 +274,13 @@ def test_demonstrations_are_counted_as_they_are_played(tmp_path):
     train(replace(config, steps=211, demonstrations=3, test_episodes=0), console)
     assert "3 demonstrations were asked for, and rounded up to 4" in said(console)
     assert "211 steps were asked for, and rounded up to 212: 200 of dem" in said(console)
+    waits = [line for line in said(console).splitlines() if line.endswith("...")]
+    assert waits == [
+        "playing 4 demonstrations of the expert and learning from them ...",
+        "first evaluation, before the policy acts ...",
+    ]
+    assert said(console).index("212 steps, in") < said(console).index(waits[0])
+    assert said(console).index(waits[1]) < said(console).index("200 steps   success")
     assert json.loads((config.run / "config.json").read_text())["demonstrations"] == 4
     assert complete(replace(config, envs=1)).demonstrations == 2
     assert complete(replace(config, demonstrations=0)).demonstrations == 0

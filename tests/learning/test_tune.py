@@ -45,7 +45,7 @@ def test_the_best_of_a_search_is_a_recipe_that_trains(tmp_path):
         (["--folder", "."], "exists; give another"),
         (["--env", "TPMReach-v0"], "no recipe of ppo for TPMReach-v0"),
         (["--engine", "no"], "engine = 'no' is not possible"),
-        (["--seed", "999971", "--engine", "analytic"], "--seed 999971: must be at most 999715"),
+        (["--seed", "999971", "--engine", "analytic"], "--seed 999971: must lie in 0 ... 999715"),
         (["--jobs", "10001"], "--jobs 10001: must be at most 10,000"),
     ],
 )

@@ -243,13 +243,35 @@ def test_the_first_row_without_a_solution_is_explained():
     with pytest.raises(UnreachableError, match="leg") as caught:
         PAPER_TPM.require_inverse([PAPER_TPM.home, (0.0, 0.03, 3.0), (0.0, 1.0, 0.8)])
     assert caught.value.point == (0.0, 0.03, 3.0)
+    assert caught.value.index == (1,)
     with pytest.raises(UnreachableError, match="loop") as caught:
         PAPER_TPM.require_evaluate([[home, apart], [flat, home]])
     assert caught.value.point == apart
+    assert caught.value.index == (0, 1)
     with pytest.raises((SingularityError, UnreachableError), match="beta"):
         PAPER_TPM.require_evaluate([home, flat])
     with pytest.raises(UnreachableError):
         PAPER_TPM.joint_positions(apart)
+
+
+def test_a_machine_that_is_defined_again_replaces_the_old_one():
+    """As in a notebook whose cell runs a second time; register_task does the same."""
+    values = {field.name: getattr(PAPER_TPM, field.name) for field in fields(PAPER_TPM)}
+    for attribute in (1, 2):
+        anew = type("Mine", (TPM,), {"__module__": __name__, "number": attribute})(**values)
+        register_machine("again", anew)
+        assert find_machine("again").number == attribute
+    with pytest.raises(ConfigurationError, match="a name other than"):
+        register_machine("again", replace(anew, payload=1.0))
+    for number in (1, 2):
+
+        def make(number=number):
+            return replace(PAPER_TPM, payload=float(number))
+
+        register_machine("made again", make)
+        assert find_machine("made again").payload == number
+    with pytest.raises(ConfigurationError, match="a name other than"):
+        register_machine("made again", anew)
 
 
 # -- other machines --------------------------------------------------------------------------------
@@ -302,7 +324,7 @@ def test_machines_are_found_by_name():
     assert len(made) == 1
     with pytest.raises(ConfigurationError, match="paper"):
         register_machine("wide", PAPER_TPM)
-    register_machine("wide", WIDE_TPM)
+    register_machine("wide", replace(WIDE_TPM))  # equal
     for unknown in ("Paper", "", None, 3, PAPER):
         with pytest.raises(ConfigurationError, match="'paper', 'wide'") as caught:
             find_machine(unknown)

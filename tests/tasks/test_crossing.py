@@ -225,7 +225,7 @@ def moving(
     def touch(*_: Any) -> tuple[FloatArray, FloatArray]:
         return none, np.zeros(rows)
 
-    end, _ = integrate(BOTH, None, steps, count, course, step, touch)
+    end, _ = integrate(BOTH, None, steps, count, course, touch)
     return end.position, (end.position - end.before) / step, end.theta
 
 

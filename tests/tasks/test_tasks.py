@@ -247,7 +247,6 @@ HOME = PAPER_TPM.mount.to_world(PAPER_TPM.home)
         ({"other": None}, r"sample\(\) = \['object', 'goal'\] .*object, other, goal"),
         ({"obj": np.zeros((2, 3))}, r"sample\(\) = .*'obj'"),
         ({"goal": np.zeros((2, 3))}, r"sample\(\)\['goal'\] = (?s:.*)shape \(2, 6\)"),
-        ({"goal": np.full((2, 6), 30.0)}, r"sample\(\)\['goal'\] = .*within 2 m .* in m"),
         ({"goal": np.zeros(6)}, r"sample\(\)\['goal'\] = (?s:.*)shape \(2, 6\)"),
         ({"object": np.full((2, 3), np.nan)}, r"sample\(\)\['object'\] = (?s:.*)finite"),
         ({"other": np.array([(0.01, -0.03, 0.015)] * 2)}, r"\['object'\] = .*clear of other"),

@@ -45,7 +45,9 @@ def test_the_command_tells_its_address_serves_this_computer_only_and_ends_quietl
 def test_an_export_is_one_page_with_an_episode(tmp_path, capsys):
     run(ViewConfig(export=tmp_path / "new" / "folder"))
     page = tmp_path / "new" / "folder" / "index.html"
-    assert capsys.readouterr().out == f"{page}\n"
+    shown = capsys.readouterr()
+    assert shown.out == f"{page}\n"
+    assert shown.err.startswith("playing an episode for the page ...\n")
     assert [file.name for file in page.parent.iterdir()] == ["index.html"]
     text = page.read_text(encoding="utf-8")
     assert "__VISER_EMBED_DATA__=" in text

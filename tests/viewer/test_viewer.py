@@ -63,7 +63,7 @@ def test_every_choice_of_modes_draws_a_posture_in_them_or_says_why(viewer):
             choose(viewer, elbows, bends)
             choose(viewer, link_7, side)
             if explore.problem:
-                assert escape(explore.problem) in explore.text
+                assert escape(explore.problem) in explore.refusal.content
             else:
                 posture = explore.posture
                 assert posture.operation == operation
@@ -111,10 +111,10 @@ def test_out_of_reach_the_robot_stays_and_the_panel_says_why(viewer):
     do(viewer, lambda: explore.drag((0.3, 2.0, 0.7)))
     assert explore.posture is before
     assert "beta" in explore.problem
-    assert "beta" in explore.text
+    assert "beta" in explore.refusal.content
     do(viewer, lambda: explore.drag(before.position))
     assert explore.problem == ""
-    assert explore.text == ""
+    assert explore.refusal.content == ""
 
 
 def test_a_page_that_drags_p_moves_the_robot(viewer):
@@ -210,7 +210,7 @@ def test_every_task_is_played_with_closed_loops(viewer, env_id):
         assert node.position == pytest.approx(state.object_position[index])
     paint, scene = viewer.server.scene.get_handle_by_name("/paint/0"), player.task.scene
     assert (paint is None) == (scene.belt is None and not scene.patches)
-    terms, torques = (plot.data for plot in play.plots)
+    terms, torques = (p.data for plots in play.plots for p in plots.values() if p.visible)
     drawn = np.array(terms[1:]).sum(axis=0)
     assert drawn == pytest.approx([sum(r.reward_terms.values()) for r in player.records])
     assert pytest.approx(np.array([r.torque for r in player.records])) == np.array(torques[1:]).T
@@ -290,7 +290,7 @@ def test_a_page_cannot_choose_what_is_imported(viewer, tmp_path, monkeypatch):
     play = viewer.play
     choose(viewer, play.env_id, "evil_module:TPMReach-v0")  # no such entry in the list
     do(viewer, play.step)
-    assert "evil_module:TPMReach-v0" in play.status
+    assert "evil_module:TPMReach-v0" in play.status.content
     choose(viewer, play.env_id, "TPMReach-v0")
     do(viewer, play.step)
     assert len(play.player.records) == 1
@@ -303,7 +303,7 @@ def test_a_speed_that_is_not_on_the_slider_is_refused(viewer, speed):
     choose(viewer, play.env_id, "TPMReach-v0")
     choose(viewer, play.speed, speed)
     do(viewer, play.play)
-    assert "speed" in play.status
+    assert "speed" in play.status.content
     assert not play.playing
     choose(viewer, play.speed, 1.0)
     do(viewer, play.step)
@@ -321,7 +321,7 @@ def test_a_policy_that_is_not_there_is_reported_and_the_viewer_goes_on(viewer):
     play = viewer.play
     choose(viewer, play.file, "nowhere/policy.json")
     do(viewer, play.step)
-    assert "nowhere/policy.json" in play.status
+    assert "nowhere/policy.json" in play.status.content
     choose(viewer, play.file, "")
     do(viewer, play.step)
     assert len(play.player.records) == 1

@@ -112,7 +112,6 @@ def reachable_set(
 
     Args:
         branch: Working mode.
-        geometry: Lengths.
         shape: Numbers of cells along x, y, z: at least 2 each, and even along y. The grid holds
             every point that the rods reach.
         limits: For example :func:`~tpm_gym.analysis.limits.within_stops`.
@@ -156,14 +155,11 @@ def regions(
     """Find the connected regions of cells with equal codes, and yield the largest region first.
 
     Args:
-        low: Corner of the grid with the smallest x, y, z, m.
+        low: Corner of the grid; see :class:`Cells`.
         spacing: Edges of a cell, m.
         codes: (nx, ny, nz) code of each cell, such as the signs of its factors as bits; negative
             for cells that belong to no region.
         min_cells: Fewest cells of a region.
-
-    Yields:
-        The code and the cells of a region.
 
     Raises:
         ConfigurationError: min_cells is no positive whole number.

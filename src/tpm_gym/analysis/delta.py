@@ -32,7 +32,6 @@ def chains(
     Args:
         theta: Joint positions.
         side: Assembly mode, the sign of det A.
-        geometry: Lengths.
         balls: If True, each leg consists of a motor and a parallelogram with ball joints, as in the
             package's Delta. If False, it consists of a motor, a revolute, a parallelogram with
             revolutes, and another revolute.
@@ -101,7 +100,6 @@ def aspects(
 
     Args:
         bends: Working mode.
-        geometry: Lengths.
         shape: Numbers of cells along x, y, z of a grid that holds every point in reach.
         within_stops: Whether to leave out points where a motor is beyond its stop.
         min_cells: Fewest cells of an aspect.

@@ -297,9 +297,7 @@ class ParallelMechanism:
 def analyse(chains: Sequence[Chain], point: ArrayLike) -> ParallelMechanism:
     """Apply Eqs. (1) to (5) to two or more chains from the base to one platform.
 
-    Args:
-        chains: Chains at one configuration.
-        point: Base point of the platform (3,) m.
+    The chains are at one configuration. ``point`` (3,) m is the base point of the platform.
 
     Raises:
         InputError: There are fewer than two chains.

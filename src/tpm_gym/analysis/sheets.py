@@ -142,8 +142,6 @@ class _Arcs:
 
     Attributes:
         curve: Function that returns points of the curve; see :data:`Curve`.
-        geometry: First argument of ``curve``, the lengths.
-        mode: Second argument of ``curve``, the working mode.
         first: (n,) first sign of each arc, -1 or 1.
         second: (n,) second sign of each arc, -1 or 1.
         middle: (n,) rad, middle of the angle's interval.
@@ -204,7 +202,6 @@ def curves(factor: str, mode: WorkingMode, geometry: Geometry) -> Point:
     Args:
         factor: ``"level3"``, ``"planar"``, ``"leg1"``, ``"leg2"`` or ``"elevation"``.
         mode: The working mode. Points of other working modes are included; see :data:`Point`.
-        geometry: Link lengths.
 
     Raises:
         InputError: If no curve belongs to a factor of this name.
@@ -266,8 +263,6 @@ def nearest(
         points: (n, 3) m, 0 <= y <= l7.
         limit: (n,) m, at most the distance to the planes y = 0 and |y| = l7, and to the boundary
             of leg 3's reach.
-        mode: The working mode.
-        geometry: Link lengths.
 
     Returns:
         Distance (n,) m, nearest point (n, 3) m and index of the factor (n,). If no surface is

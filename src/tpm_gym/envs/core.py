@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import FloatArray, IntArray, finite, numbers
+from tpm_gym.arrays import FloatArray, IntArray, Vector, finite, numbers
 from tpm_gym.envs.rendering import Pixels, Rendering
 from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.mechanism.machine import Machine
@@ -21,21 +21,13 @@ from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks import checking
 from tpm_gym.tasks.control import Follower, make_control
 from tpm_gym.tasks.registry import make_task
-from tpm_gym.tasks.task import GOAL_BOUND, Task
+from tpm_gym.tasks.task import Task
 
 if TYPE_CHECKING:
     from tpm_gym.envs.shield import BrakingShield, Shield
 
-__all__ = [
-    "Core",
-    "EnvSnapshot",
-    "Observation",
-    "action_space",
-    "compute_reward",
-    "seed_of",
-]
-
 OBSERVATION_BOUND = 10.0
+GOAL_BOUND = 2.0
 
 INFO: Final = {
     "is_success": bool,
@@ -128,7 +120,8 @@ class Core:
         self.drive, self.randomisation = drives_and_randomisation(drive, randomisation)
         self.randomisation.require_fitting(self.machine)
         self._altered = self.randomisation != Randomisation()
-        self._follower = self._make_follower()
+        limits, period = _accelerations(self.task), self.task.control_period
+        self._follower = None if limits is None else Follower(self.machine, *limits, period)
         self._shield = None if shield is False else self._make_shield(shield)
         self._rendering = Rendering(self.machine, render_mode, camera, width, height)
         self._pixels: Pixels | None = None
@@ -175,14 +168,6 @@ class Core:
         exact = self.drive is None and not self._altered
         return make_shield(shield, self.machine, self.control, self._follower, exact)
 
-    def _make_follower(self) -> Follower | None:
-        if self.task.accelerations is None:
-            return None
-        limits = finite("accelerations", self.task.accelerations, (2, 3), ConfigurationError)
-        if not (limits > 0).all():
-            raise ConfigurationError("accelerations", limits.tolist(), "positive numbers, m/s^2")
-        return Follower(self.machine, *self.task.accelerations, self.task.control_period)
-
     def _start(self) -> Simulation:
         return Simulation(
             self.task.scene,
@@ -203,20 +188,16 @@ class Core:
         Args:
             rows: (r,) environments.
             rngs: Their generators from now on.
-            options: As in :meth:`tpm_gym.TPMEnv.reset`.
+            options: As in :meth:`tpm_gym.TPMEnv.reset`, whose errors are raised.
 
         Returns:
             The randomisation of each episode; empty dictionaries without randomisation.
-
-        Raises:
-            ResetOptionError: If an option is not possible; the environments are then unchanged.
-            UnreachableError: If an object or the goal is out of reach; the environments are then
-                unchanged.
         """
         self.require_open()
         before = [rng.bit_generator.state for rng in rngs] if options is not None else []
         try:
             starts = self.task.start(rngs, options)
+            _require_in_space(starts["goal"])
         except BaseException:
             for rng, state in zip(rngs, before, strict=False):
                 rng.bit_generator.state = state
@@ -320,11 +301,7 @@ class Core:
     # -- pictures ---------------------------------------------------------------------------
 
     def frame(self, row: int) -> Any:
-        """Draw an environment in its ``render_mode``.
-
-        Raises:
-            EpisodeError: If the environments are closed, or before the first reset.
-        """
+        """Draw an environment in its ``render_mode``; see :meth:`tpm_gym.TPMEnv.render`."""
         return self._rendering.frame(self.simulation, row, self._markers(row))
 
     def show(self) -> None:
@@ -352,25 +329,14 @@ class Core:
 
     @property
     def state(self) -> State:
-        """The state after the last step or reset.
-
-        Raises:
-            EpisodeError: If no episode is running.
-        """
+        """The state after the last step or reset; raise EpisodeError if no episode is running."""
         if self._state is None:
             self.require_open()
             raise EpisodeError("no episode is running; call reset() first")
         return self._state
 
     def save(self, **columns: NDArray[Any]) -> EnvSnapshot:
-        """Return a snapshot of everything that the next steps depend on.
-
-        Args:
-            columns: Further arrays to keep in the snapshot, by name.
-
-        Raises:
-            EpisodeError: If no episode is running.
-        """
+        """Return a snapshot; ``columns`` are further arrays to keep in it, by name."""
         _ = self.state  # raises without an episode
         rngs = [{**rng.bit_generator.state, "seed": seed_of(rng)} for rng in self.rngs]
         own = {"goals": self.goals, "pending": self._pending, "views": self._views, **columns}
@@ -385,13 +351,7 @@ class Core:
         return snapshot
 
     def restore(self, snapshot: Any) -> Observation:
-        """Continue from a snapshot of these or equal environments; return the observation.
-
-        Raises:
-            EpisodeError: If the environments are closed.
-            InputError: If ``snapshot`` is no snapshot of equal environments; the environments are
-                then unchanged.
-        """
+        """Continue from a snapshot, as :meth:`tpm_gym.TPMEnv.restore_state`."""
         self.require_open()
         self.require_equal(snapshot)
         self.rngs = [np.random.default_rng(state.get("seed")) for state in snapshot.rngs]
@@ -485,6 +445,24 @@ def _box(bound: float, length: int) -> spaces.Box:
     return spaces.Box(-bound, bound, (length,), np.float32)
 
 
+def _accelerations(task: Task) -> tuple[Vector, Vector] | None:
+    """Return the limits of a task's accelerations; refuse limits that are not positive."""
+    if task.accelerations is None:
+        return None
+    limits = finite("accelerations", task.accelerations, (2, 3), ConfigurationError)
+    if not (limits > 0).all():
+        raise ConfigurationError("accelerations", limits.tolist(), "positive numbers, m/s^2")
+    return task.accelerations
+
+
+def _require_in_space(goals: FloatArray) -> None:
+    """Refuse goals (r, goal_size) m out of the observation space, which P cannot achieve."""
+    beyond = np.abs(goals).max(axis=1) > GOAL_BOUND
+    if beyond.any():
+        valid = f"coordinates from -{GOAL_BOUND:g} to {GOAL_BOUND:g} m, as the observation space"
+        raise ConfigurationError("sample()['goal']", goals[beyond][0].tolist(), valid)
+
+
 def _goal_free(terms: Mapping[str, Any]) -> Any:
     """Return the sum of the reward terms that do not depend on the goal."""
     total: Any = 0.0
@@ -511,11 +489,7 @@ def _not_finite(
 
 
 def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:
-    """Compute the reward of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`.
-
-    Raises:
-        InputError: If the goals are no real numbers of fitting shapes, or ``info`` does not fit.
-    """
+    """Compute rewards of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`."""
     _require_goals(task.goal_size, achieved, desired)
     goal_term = np.asarray(task.goal_term(task.gap(achieved, desired)))
     try:

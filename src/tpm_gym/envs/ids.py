@@ -16,8 +16,6 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.tasks.registry import TASKS, option_name
 from tpm_gym.tasks.task import Task
 
-__all__ = ["ENTRY_POINT", "env_ids", "register_task"]
-
 ENTRY_POINT = "tpm_gym.envs.single:TPMEnv"
 VECTOR_ENTRY_POINT = "tpm_gym.envs.vector:TPMVectorEnv"
 

@@ -16,8 +16,6 @@ from tpm_gym.simulation.imaging import View, camera_of
 from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.tasks.task import Task
 
-__all__ = ["RENDER_MODES", "Pixels", "Rendering"]
-
 RENDER_MODES = ("human", "rgb_array", "depth_array", "rgbd_tuple", "segmentation")
 """Values of ``render_mode``."""
 
@@ -43,19 +41,14 @@ class Rendering:
         self.view = View(camera, int(width), int(height), segmented)
 
     def frame(self, simulation: Simulation, row: int, markers: ArrayLike) -> Any:
-        """Draw one environment in the render mode.
-
-        Args:
-            simulation: Simulation of all environments.
-            row: Index of the environment.
-            markers: Points (k, 3) m, world frame, at which the k goal markers are drawn.
+        """Draw one environment in the render mode, with goal markers at points (k, 3) m, world.
 
         Raises:
             ConfigurationError: If the engine cannot draw in the render mode.
         """
-        if self.mode == "rgb_array":
-            return simulation.picture(self.view, markers, row).colour
         picture = simulation.picture(self.view, markers, row)
+        if self.mode == "rgb_array":
+            return picture.colour
         found = picture.segmentation if self.mode == "segmentation" else picture.depth
         if found is None:
             raise ConfigurationError("render_mode", self.mode, "'rgb_array' with this engine")
@@ -94,12 +87,9 @@ class Pixels:
         simulation: Simulation,
         rows: Iterable[tuple[int, ArrayLike]],
     ) -> dict[str, Any]:
-        """Return observations with a picture of each environment.
+        """Return observations (n, ...) with a picture of each environment.
 
-        Args:
-            observation: Observations without pictures, rows first.
-            simulation: Simulation to draw.
-            rows: Row and goal markers of each environment.
+        ``rows`` has the row and the goal markers of each environment.
         """
         frames = [self._rendering.frame(simulation, row, markers) for row, markers in rows]
         kept = np.ascontiguousarray(observation["observation"][:, self._columns])

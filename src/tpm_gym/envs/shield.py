@@ -7,14 +7,8 @@ conditioning 1/cond(J) stays at ``least`` or above on this curve and this line. 
 to hold the last command c: P then moves on the line from b to c, and the check of c included this
 line.
 
-The curve and the line lie in the triangle of b, c and d. The safe part of the region is almost
-convex. Therefore the nearest safe command is mostly the nearest point of the surface ``conditioning
-= least``. This point is found by sequential quadratic programming, and its path is checked. If the
-check fails, the search is repeated with a larger conditioning as its aim. If all searches fail, the
-command is moved towards the last command.
-
-If a task bounds the accelerations of commands, a robot cannot hold the last command at once. For
-such tasks, :class:`BrakingShield` allows only commands after which the robot can brake in time.
+Sequential quadratic programming finds the nearest safe command; docs/shield.md says why it can.
+:class:`BrakingShield` is for tasks in which a robot cannot hold the last command at once.
 
 Importing this module imports Numba.
 """
@@ -32,8 +26,6 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
 from tpm_gym.tasks.control import Control, Follower
-
-__all__ = ["BrakingShield", "Shield", "make_shield"]
 
 MARGIN = 0.15
 """Extra conditioning that shields keep with servo drives or randomised plants, as a fraction of the
@@ -263,7 +255,6 @@ def make_shield(
     Args:
         shield: The conditioning to keep, or True for the machine's ``safe_conditioning``.
         machine: Nominal machine.
-        control: Control of the environment.
         follower: Limit of the control's commands, if their accelerations are bounded.
         exact: Whether the robot follows its commands exactly. If it does not, the conditioning to
             keep with ``shield=True`` is (1 + :data:`MARGIN`) times ``safe_conditioning``.
@@ -343,10 +334,7 @@ def solved(
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.
         lack: (r,) conditioning that is lacking at ``point``.
-        wanted: See :class:`Problem`.
-        last: See :class:`Problem`.
-        low: See :class:`Problem`.
-        high: See :class:`Problem`.
+        wanted, last, low, high: See :class:`Problem`.
 
     Returns:
         Points (r, 3) m, and how far (r,) they are from ``point`` in units of the action.

@@ -31,8 +31,6 @@ from tpm_gym.simulation.simulation import Simulation
 from tpm_gym.simulation.state import CONTROL_PERIOD, State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TPMEnv"]
-
 Action = NDArray[Any]
 
 _ROW = np.array([0])
@@ -43,8 +41,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Ids
 
-    ``TPM<task>{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense reward. The
-    classes of :mod:`tpm_gym.tasks` explain the tasks.
+    ``TPM<task>{,Joints}{,Dense}-v0``: Cartesian or joint increments, sparse or dense goal term.
+    The classes of :mod:`tpm_gym.tasks` explain the tasks.
 
     | task | action | observation | goal | steps | what to do |
     | --- | --- | --- | --- | --- | --- |
@@ -113,9 +111,9 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Reward
 
-    ``goal`` term + ``singularity`` term (+ ``gate`` in Cycle, and in dense rewards ``approach``
-    where there are objects). In Stack, the distance is that of the block farther from its goal, and
-    the cup approaches the upper block.
+    ``goal`` term + ``singularity`` term (+ ``gate`` in Cycle, in sparse rewards too; + in dense
+    rewards ``approach`` where there are objects). In Stack, the distance is that of the block
+    farther from its goal, and the cup approaches the upper block.
 
     | term | value |
     | --- | --- |
@@ -310,7 +308,6 @@ class TPMEnv(gym.Env[Observation, Action]):
             ConfigurationError: If a method of the task returns a wrong shape, type or value.
         """
         core, rng = self._core, None
-        core.require_open()
         if seed is not None:
             rng, seed = seeding.np_random(seed)
         (randomisation,) = core.reset(_ROW, [self.np_random if rng is None else rng], options)

@@ -34,9 +34,8 @@ from tpm_gym.simulation.imaging import tile
 from tpm_gym.simulation.state import State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TPMVectorEnv"]
-
 _MOST = 10**6  # largest number of environments; those of pick-and-place take some 10 GB
+_FEWEST = 1024  # smallest number of environments for each of several threads
 
 Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
@@ -44,19 +43,17 @@ Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     """n environments that are stepped together.
 
-    Spaces, rewards, seeds and infos are as in :class:`~tpm_gym.TPMEnv`. In the analytic engine, the
-    results of an environment do not depend, in any bit, on the number of environments and threads.
-    Infos have the form of Gymnasium's vector environments, with a mask ``_key`` for each ``key``.
+    Spaces, rewards, seeds, infos and further arguments are as in :class:`~tpm_gym.TPMEnv`. In the
+    analytic engine, the results of an environment do not depend, in any bit, on the number of
+    environments and threads. Infos have the form of Gymnasium's vector environments, with a mask
+    ``_key`` for each ``key``.
 
     Args:
-        task: See :class:`~tpm_gym.TPMEnv`.
-        control: See :class:`~tpm_gym.TPMEnv`.
-        reward: See :class:`~tpm_gym.TPMEnv`.
         num_envs: Number of environments, n.
-        engine: See :class:`~tpm_gym.TPMEnv`. ``"analytic"`` computes all environments together.
-            With other engines, each environment has its own engine, and the environments are
-            stepped one after another.
-        num_threads: Threads that step the environments of the analytic engine.
+        engine: ``"analytic"`` computes all environments together. With other engines, each
+            environment has its own engine, and the environments are stepped one after another.
+        num_threads: Largest number of threads that step the environments of the analytic engine.
+            Each thread steps at least 1,024 environments: with fewer, one thread is faster.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         autoreset_mode: Time of the reset after the end of an episode: ``NEXT_STEP``, ``SAME_STEP``
             (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (the user calls
@@ -64,7 +61,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         stagger: Whether the first episodes after a full reset have different lengths, so that
             they do not all end at the same step. This makes on-policy batches more even.
         render_mode: As in :class:`~tpm_gym.TPMEnv`, but not ``"human"``.
-        options: Other options of :class:`~tpm_gym.TPMEnv`.
 
     Raises:
         ConfigurationError: If an option is out of range.
@@ -121,7 +117,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             raise
         ends = np.cumsum([part.core.count for part in self._parts]).tolist()
         self._slices = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
-        self._threads = int(num_threads)
+        self._threads = len(self._parts) if at_most is None else 1
         self._pool = self._make_pool()
         first = self._parts[0].core
         self.metadata["render_fps"] = round(1 / first.task.control_period)
@@ -194,8 +190,7 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
             lengths = np.arange(self.num_envs) * self._stagger // self.num_envs
             for part, rows in zip(self._parts, self._slices, strict=True):
                 part.elapsed[:] = lengths[rows]
-        observation, infos = self._merged(found)
-        return observation, infos
+        return self._merged(found)
 
     def _mask(self, mask: Any) -> BoolArray:
         array = np.asarray(mask)
@@ -295,7 +290,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the simulations and the threads."""
-        del kwargs
         # Gymnasium before 1.3 also closes an environment whose constructor raised, so that
         # attributes may be missing.
         for part in getattr(self, "_parts", ()):
@@ -316,7 +310,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         Raises:
             EpisodeError: If no episode is running.
         """
-        self._require_open()
         states = [vars(part.core.state) for part in self._parts]
         if len(states) == 1:
             return State(**states[0])
@@ -357,7 +350,6 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         Raises:
             EpisodeError: If no episode is running.
         """
-        self._require_open()
         return [part.core.save(elapsed=part.elapsed, ended=part.ended) for part in self._parts]
 
     def restore_state(self, snapshots: Sequence[EnvSnapshot]) -> Observation:
@@ -459,11 +451,7 @@ class _Part:
 
         In ``observation`` and in the returned infos, the first values of the new episodes replace
         the last values of the ended episodes. The last values are in ``final_obs`` and
-        ``final_info`` of the returned infos.
-
-        Args:
-            observation: Observations after the last step; changed.
-            last: Infos after the last step.
+        ``final_info`` of the returned infos. ``last`` are the infos after the last step.
         """
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
@@ -500,10 +488,10 @@ class _Part:
 def _sizes(count: int, most: int | None, threads: int) -> list[int]:
     """Divide ``count`` environments into parts, and return the sizes of the parts.
 
-    ``most`` is the largest size of a part. If it is None, there are as many parts as ``threads``,
-    but at most ``count``.
+    ``most`` is the largest size of a part. If it is None, each of the ``threads`` has a part, but
+    there are so few parts that each has enough environments for a thread.
     """
-    parts = min(threads, count) if most is None else -(-count // most)
+    parts = min(threads, max(count // _FEWEST, 1)) if most is None else -(-count // most)
     return [count // parts + (k < count % parts) for k in range(parts)]
 
 
@@ -516,9 +504,9 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
-    """Return ``info`` with a mask ``_key`` (count,) for each ``key``.
+    """Return ``info`` with a mask ``_key`` (count,) for each ``key``; it is true in ``rows``.
 
-    The mask is true in ``rows``, or everywhere if ``rows`` is None.
+    If ``rows`` is None, it is true everywhere.
     """
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
@@ -533,11 +521,7 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return a copy of the infos ``last``, in which ``first`` replaces the values of ``rows``.
-
-    ``last`` are the infos of a step, and ``first`` the infos of new episodes in the environments
-    ``rows``.
-    """
+    """Return a copy of the infos ``last`` of a step, with the infos ``first`` of new episodes."""
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):

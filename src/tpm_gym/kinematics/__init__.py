@@ -15,12 +15,7 @@ from tpm_gym.kinematics.modes import (
     RotatedMode,
     WorkingMode,
 )
-from tpm_gym.kinematics.position import (
-    forward,
-    forward_all,
-    inverse,
-    inverse_all,
-)
+from tpm_gym.kinematics.position import forward, forward_all, inverse, inverse_all
 from tpm_gym.kinematics.rotated import RotatedPostures, forward_rotated, inverse_rotated
 
 __all__ = [

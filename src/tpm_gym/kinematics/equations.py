@@ -211,8 +211,6 @@ def arm(
         out: Distance of C from the arm's plane, m.
         bend: Sign of BC . dB/dtheta = l3 (b cos(theta) - a sin(theta)); it selects one of the two
             solutions.
-        g: Lengths.
-        ns: Namespace.
 
     Returns:
         The angle, and whether the leg reaches C.
@@ -342,7 +340,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
         cos, sin = arms(tuple(map(np.float64, theta)), g, NUMPY)
         _, _, found = assembly_at(cos, sin, branch.planar, branch.sin_beta, g, NUMPY)
     free, y1, distance2, level, vertical = map(float, found)
-    hint = f"choose joint angles within reach (branch {branch})"
+    hint = f"choose joint angles at which {branch} exists"
     if free:
         return UnreachableError(theta, "loop 2 (beta is free: a2 = b2 = 0)", 0.0, hint)
     if abs(y1) >= g.l4:
@@ -358,7 +356,7 @@ def no_assembly(theta: Vector, branch: AssemblyMode, g: Geometry) -> Unreachable
 
 def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableError:
     """Explain which leg does not reach a point (3,) m in a working mode, and by how much."""
-    hint = f"choose a point of the workspace (branch {branch}; see tpm_gym.kinematics.workspace)"
+    hint = f"choose a point that {branch} reaches (tpm_gym.kinematics.workspace)"
     beyond = g.l7 - abs(point[1])
     if beyond < 0:
         return UnreachableError(point, "beta (|y| <= l7)", beyond, hint)
@@ -374,11 +372,7 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
     """Return the margin by which a leg reaches C, m; negative if the leg does not reach C.
 
-    Args:
-        level: Horizontal distance of C from A in the arm's plane, m.
-        vertical: Vertical distance of C from A, m.
-        out: Distance of C from the arm's plane, m.
-        g: Lengths.
+    ``level``, ``vertical`` and ``out`` are the arguments a, b and out of :func:`arm`, m.
     """
     if abs(out) >= g.l4:
         return g.l4 - abs(out)

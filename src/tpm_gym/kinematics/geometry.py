@@ -1,6 +1,6 @@
 """Seven lengths that define the mechanism, with their checks."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from tpm_gym.arrays import is_number
@@ -54,12 +54,11 @@ class Geometry:
 
     def __post_init__(self) -> None:
         """Reject lengths that make no mechanism."""
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
+        for name, value in vars(self).items():
             if not is_number(value) or value < 0 or (value == 0 and name != "l6"):
                 least = "not negative" if name == "l6" else "positive"
                 raise GeometryError(name, value, f"it must be a finite number, {least}")
-            object.__setattr__(self, name, float(value))
+            object.__setattr__(self, name, float(value))  # no key is added
         l1, l5 = self.l1, self.l5
         close = _CLOSE * l1
         if self.l3 > l1 - close and min(l5, abs(l5 - l1)) < close:

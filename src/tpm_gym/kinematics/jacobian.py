@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, first_row, points
+from tpm_gym.arrays import FloatArray, explained, finite_points, points
 from tpm_gym.errors import SingularityError
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.equations import Factors as Factors
@@ -223,7 +223,7 @@ def _from_angles(
     angles = finite_points("theta", theta)
     missing, *found = by_rows(text, angles)
     if missing.any():
-        raise equations.no_assembly(first_row(angles, missing != 0), branch, g)
+        raise explained(lambda a: equations.no_assembly(a, branch, g), angles, missing != 0)
     return found
 
 

@@ -99,12 +99,7 @@ def _torch() -> Namespace:
     def like(x: Any, other: Any) -> Any:
         return torch.as_tensor(x, dtype=other.dtype, device=other.device)
 
-    def sqrt(x: Any) -> Any:
-        none = x == 0
-        return torch.where(none, 0.0, torch.where(none, 1.0, x).sqrt())
-
-    def root(x: Any) -> Any:
-        none = x <= 0
+    def root(x: Any, none: Any) -> Any:
         return torch.where(none, 0.0, torch.where(none, 1.0, x).sqrt())
 
     def arccos(x: Any) -> Any:
@@ -120,8 +115,8 @@ def _torch() -> Namespace:
         cos=torch.cos,
         sin=torch.sin,
         arctan2=lambda y, x: torch.arctan2(y, like(x, y)),
-        sqrt=sqrt,
-        root=root,
+        sqrt=lambda x: root(x, x == 0),
+        root=lambda x: root(x, x <= 0),
         clip=lambda x: torch.clip(x, -1.0, 1.0),
         arccos=arccos,
         arcsin=lambda x: math.pi / 2 - arccos(x),

@@ -1,13 +1,13 @@
-"""Forward and inverse kinematics of points and batches, on all branches or on a named branch.
+"""Forward and inverse kinematics of points and batches, in all modes or in one mode.
 
 Positions are in the paper's frame; units are m and rad. :mod:`tpm_gym.kinematics.modes` names and
-orders the branches. Torch tensors give tensors on the same device, in float64, which can be
-differentiated. Where branches merge, the derivative is 0 instead of infinite.
+orders the modes. Torch tensors give tensors on the same device, in float64, which can be
+differentiated. Where solutions merge, the derivative is 0 instead of infinite.
 
 All functions raise InputError for inputs that are no array (..., 3) of numbers. If a vector (3,) of
-the array is not finite, functions on all branches return invalid branches for this vector, and
-functions on one branch raise InputError. Functions on one branch raise UnreachableError if the
-branch does not exist for some vector.
+the array is not finite, functions of all modes return invalid solutions for this vector, and
+functions of one mode raise InputError. Functions of one mode raise UnreachableError if some vector
+has no solution in this mode.
 """
 
 import math
@@ -15,7 +15,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, finite_points, first_row, points
+from tpm_gym.arrays import FloatArray, explained, finite_points, points
 from tpm_gym.kinematics import equations
 from tpm_gym.kinematics.geometry import PAPER, Geometry, require_geometry
 from tpm_gym.kinematics.modes import (
@@ -33,9 +33,9 @@ from tpm_gym.kinematics.namespaces import Namespace, by_rows
 
 
 def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolutions:
-    """Solve the forward kinematics on all 4 branches, at actuated angles theta (..., 3) rad.
+    """Solve the forward kinematics in all 4 assembly modes, at actuated angles theta (..., 3) rad.
 
-    A branch keeps its slot as theta changes. Its results are NaN where the branch is not real; but
+    A mode keeps its slot as theta changes. Its results are NaN where it has no solution; but
     where the mechanism closes for every beta, z is not NaN. For assemblies with link 3' turned, see
     :func:`.rotated.forward_rotated`.
     """
@@ -46,7 +46,7 @@ def forward_all(theta: ArrayLike, geometry: Geometry = PAPER) -> ForwardSolution
 
 
 def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolutions:
-    """Solve the inverse kinematics on all 16 branches, for point P at position (..., 3) m."""
+    """Solve the inverse kinematics in all 16 working modes, for P at position (..., 3) m."""
     require_geometry(geometry)
     places = points("position", position)
     theta, beta = by_rows(lambda p, ns: _postures(p, geometry, ns), places)
@@ -56,9 +56,11 @@ def inverse_all(position: ArrayLike, geometry: Geometry = PAPER) -> InverseSolut
 def forward(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute the position of P (..., 3) m at theta (..., 3) rad, on one named branch.
+    """Compute the position of P (..., 3) m at theta (..., 3) rad, in the assembly mode ``branch``.
 
-    The default branch gives y > 0; ``AssemblyMode(-1, -1)`` gives the mirror image at y < 0.
+    The default gives y > 0; ``AssemblyMode(-1, -1)`` gives the mirror image at y < 0. So
+    ``forward(inverse(point))`` is the point only if its assembly mode is the default. The mode of
+    any point is ``ASSEMBLY_MODES[assembly_of(point)]``, by :func:`.workspace.assembly_of`.
     """
     return assembled(theta, branch, geometry).position[..., branch.index, :]
 
@@ -66,24 +68,24 @@ def forward(
 def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute angles (..., 3) rad, in the ranges of :class:`.InverseSolutions`, on one branch."""
+    """Compute angles (..., 3) rad, in the ranges of :class:`.InverseSolutions`, in one mode."""
     require_mode(branch, WorkingMode)
     places = finite_points("position", position)
     solutions = inverse_all(places, geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
-        raise equations.no_posture(first_row(places, ~valid), branch, geometry)
+        raise explained(lambda p: equations.no_posture(p, branch, geometry), places, ~valid)
     return solutions.theta[..., branch.index, :]
 
 
 def assembled(theta: ArrayLike, branch: AssemblyMode, geometry: Geometry) -> ForwardSolutions:
-    """Compute all solutions; raise UnreachableError where ``branch`` does not exist."""
+    """Compute all solutions; raise UnreachableError where ``branch`` has none."""
     require_mode(branch, AssemblyMode)
     angles = finite_points("theta", theta)
     solutions = forward_all(angles, geometry)
     valid = solutions.valid[..., branch.index]
     if not valid.all():
-        raise equations.no_assembly(first_row(angles, ~valid), branch, geometry)
+        raise explained(lambda a: equations.no_assembly(a, branch, geometry), angles, ~valid)
     return solutions
 
 

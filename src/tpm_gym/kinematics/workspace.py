@@ -6,7 +6,6 @@ All points are in the paper's frame, in metres. Each function considers one work
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -53,10 +52,7 @@ class Region:
 
     def project(self, points: ArrayLike) -> FloatArray:
         """Return the nearest points of the box to points (..., 3)."""
-        array: Any = points
-        plain = type(points) is np.ndarray and points.dtype.char == "d"  # the common case, fast
-        if not plain or array.shape[-1:] != (3,):
-            array = _points("points", numbers("points", points))
+        array = _points("points", numbers("points", points))
         nearest: FloatArray = np.minimum(np.maximum(array, self.low), self.high)
         return nearest
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from tpm_gym.learning.errors import LearningError as LearningError
     from tpm_gym.learning.evaluation import EvaluationConfig as EvaluationConfig
     from tpm_gym.learning.evaluation import evaluate as evaluate
+    from tpm_gym.learning.export import save_policy as save_policy
     from tpm_gym.learning.features import GoalGapExtractor as GoalGapExtractor
     from tpm_gym.learning.hindsight import PenaltyHerReplayBuffer as PenaltyHerReplayBuffer
     from tpm_gym.learning.recipes import recipe as recipe
@@ -41,6 +42,7 @@ _MODULES = {
     "evaluate": "evaluation",
     "recipe": "recipes",
     "resume": "training",
+    "save_policy": "export",
     "train": "training",
 }
 __all__ = list(_MODULES)

@@ -109,6 +109,10 @@ class Algorithm:
                 return own.get(name, parameters[name].default)
         return None
 
+    def hyperparameters(self) -> set[str]:
+        """Return the constructor's arguments that a recipe can have; models have them, too."""
+        return _ENTRIES.keys() & inspect.signature(self.load_class()).parameters.keys()
+
     def entries(self) -> Any:
         """Return the type of the algorithm's recipes, a TypedDict.
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
@@ -49,6 +48,7 @@ class PeriodicEvaluation(BaseCallback):
 
     def _on_training_start(self) -> None:
         if not self.evaluations:
+            self.console.print("first evaluation, before the policy acts ...")
             self._evaluate()
 
     def _init_callback(self) -> None:
@@ -105,28 +105,21 @@ def quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
     return evaluation["success_at_end"]["mean"], evaluation["return"]["mean"]
 
 
-class ProgressBar(BaseCallback):
-    """Progress bar, which is shown on a terminal only."""
+@dataclass(eq=False)
+class Progress(BaseCallback):
+    """Progress of a training; ``advance`` is called with the number of new steps."""
 
-    def __init__(self, console: Console) -> None:
-        """Lay out the bar without showing it."""
+    advance: Callable[[int], object]
+
+    def __post_init__(self) -> None:
+        """Initialise the callback."""
         super().__init__()
-        columns = (*Progress.get_default_columns(), MofNCompleteColumn())
-        self._progress = Progress(*columns, console=console, disable=not console.is_terminal)
-        self._task = self._progress.add_task("training", start=False)
-
-    def _on_training_start(self) -> None:
-        self._progress.start()
-        self._progress.start_task(self._task)
-        self._progress.update(self._task, total=self.locals["total_timesteps"])
+        self._shown = 0
 
     def _on_step(self) -> bool:
-        self._progress.update(self._task, completed=self.num_timesteps)
+        self.advance(self.num_timesteps - self._shown)
+        self._shown = self.num_timesteps
         return True
-
-    def close(self) -> None:
-        """Restore the terminal; safe to call at any time."""
-        self._progress.stop()
 
 
 class StopTrainingError(Exception):

@@ -49,10 +49,7 @@ class CheckpointStore:
 
     @property
     def newest(self) -> int | None:
-        """Step of the checkpoint that was saved or loaded last.
-
-        None if no checkpoint was saved or loaded yet, and after :meth:`clear`.
-        """
+        """Step of the checkpoint that was saved or loaded last; None if there is none."""
         return self._whole[-1] if self._whole else None
 
     def path(self, step: int) -> Path:

@@ -3,7 +3,7 @@
 import signal
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,14 @@ import tyro
 from tyro.conf import Positional, subcommand
 
 from tpm_gym import TPMError, learning
-from tpm_gym.learning.configuration import ResumeConfig, TrainingConfig, unset
+from tpm_gym.learning.configuration import (
+    UNSET,
+    EnvOptions,
+    GivenEnvOptions,
+    ResumeConfig,
+    TrainingConfig,
+    unset,
+)
 from tpm_gym.learning.datasets import CollectConfig, collect
 from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
 from tpm_gym.learning.tune import TuneConfig, tune
@@ -23,7 +30,8 @@ class ExportConfig:
     """Write a trained policy as safetensors and JSON. Loading these files runs no code."""
 
     model: Annotated[Positional[Path], tyro.conf.arg(metavar="MODEL")]
-    """best.zip or last.zip in the folder of a run, or an exported policy (.json)."""
+    """Folder of a run (its best policy), a .zip of Stable-Baselines3, such as last.zip in such a
+    folder, or an exported policy (.json)."""
 
     out: Annotated[Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Path of the new files without their endings. Files of an earlier policy or model card are
@@ -31,6 +39,11 @@ class ExportConfig:
 
     trust_pickle: bool = False
     """Load a .zip file, which can run any code."""
+
+    env: Annotated[str, unset(str, "the run's", "ID")] = UNSET
+    """Environment id of the training, or module:id. A .zip outside the folder of a run needs it."""
+
+    env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     evaluation: Annotated[Path | None, unset(Path, "no card", "PATH")] = None
     """File that evaluate --json wrote. If it is given, a model card for the Hugging Face Hub is
@@ -48,6 +61,10 @@ Command = (
 )
 
 
+def _say_loading() -> None:
+    print("loading PyTorch ...", flush=True)
+
+
 def main(words: Sequence[str] | None = None) -> None:
     """Run a command line, by default ``sys.argv``, and exit with its status.
 
@@ -62,8 +79,10 @@ def main(words: Sequence[str] | None = None) -> None:
     try:
         match command:
             case TrainingConfig():
+                _say_loading()
                 stopped_by = learning.train(command)
             case ResumeConfig():
+                _say_loading()
                 stopped_by = learning.resume(command)
             case EvaluationConfig():
                 evaluate(command)
@@ -74,14 +93,16 @@ def main(words: Sequence[str] | None = None) -> None:
             case ViewConfig():
                 run(command)
             case ExportConfig():
+                print(f"exporting {command.model} and comparing its actions ...", flush=True)
                 from tpm_gym.learning import export, model_card  # PyTorch is needed here only
 
-                print(f"exporting {command.model} and comparing its actions ...", flush=True)
                 evaluation = command.evaluation
                 policy = export.convert(
                     command.model,
                     command.out,
                     trust_pickle=command.trust_pickle,
+                    env_id=command.env,
+                    env_options=command.env_options,
                     evaluation=evaluation,
                 )
                 print(policy)

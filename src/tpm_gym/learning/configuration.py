@@ -65,10 +65,7 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_shield(words: Sequence[str]) -> bool | float:
-    """Parse the words after ``--shield``: True, False or a conditioning.
-
-    If no word follows ``--shield``, return True.
-    """
+    """Parse the words after ``--shield``: True, False or a conditioning; no word means True."""
     text = " ".join(words) or "True"
     return text == "True" if text in ("True", "False") else float(text)
 
@@ -363,6 +360,13 @@ def check_least(config: Any, least: int, *names: str) -> None:
             raise ConfigError(f"--{name.replace('_', '-')} {value}: must be at least {least}")
 
 
+def check_seed(seed: int, count: int) -> None:
+    """Refuse ``count`` seeds from ``seed`` on, by a ConfigError, if any is negative or held out."""
+    most = SELECTION_SEED - count
+    problem = f"must lie in 0 ... {most}: seeds from {SELECTION_SEED} up are held out"
+    _refuse(not 0 <= seed <= most, f"--seed {seed}: {problem}")
+
+
 def _refuse(wrong: bool, problem: str) -> None:
     if wrong:
         raise ConfigError(problem)
@@ -380,17 +384,14 @@ def _check_numbers(config: TrainingConfig) -> None:
     counts = ("steps", "envs", "eval_every", "eval_episodes", "checkpoint_every", "threads")
     check_least(config, 1, *counts)
     check_least(config, 0, "test_episodes", "demonstrations")
-    envs, seed, episodes = config.envs or 1, config.seed, config.eval_episodes or 1
-    threads = config.threads
+    envs, episodes, threads = config.envs or 1, config.eval_episodes or 1, config.threads
     _refuse(threads > _MOST_THREADS, f"--threads {threads}: must be at most {_MOST_THREADS:,}")
     most = TEST_SEED - SELECTION_SEED
     _refuse(episodes > most, f"--eval-episodes {episodes}: must be at most {most:,}")
     most = SELECTION_SEED if config.env_options.in_batches else _MOST_PROCESSES
     problem = f"--envs {envs} (n_envs of the recipe, if not given): must be at most {most:,}"
     _refuse(envs > most, problem)
-    most = SELECTION_SEED - envs
-    problem = f"must lie in 0 ... {most}: seeds from {SELECTION_SEED} up are held out"
-    _refuse(not 0 <= seed <= most, f"--seed {seed}: {problem}")
+    check_seed(config.seed, envs)
 
 
 def _check_recipe(config: TrainingConfig) -> None:
@@ -398,14 +399,14 @@ def _check_recipe(config: TrainingConfig) -> None:
     shown, envs, where = f"--steps {config.steps}", config.envs, f"--recipe {config.recipe_file}"
     _refuse(
         config.steps <= config.demonstrated,
-        f"{shown}: must be more than the {config.demonstrated:,} of the demonstrations; for a "
-        "short trial give fewer --demonstrations",
+        f"{shown}: must be more than the {config.demonstrated:,} of the demonstrations; give "
+        "more --steps, or fewer --demonstrations to tpm-gym train",
     )
     length = "train_freq" if config.argument("train_freq") else "n_steps"
     _refuse(
         config.steps - config.demonstrated < config.rollout,
         f"{shown}: one rollout takes {config.rollout:,} ({envs} environments x {length}); give "
-        "more steps, or fewer --envs",
+        "more --steps, or fewer --envs to tpm-gym train",
     )
     if config.argument("normalize_advantage"):
         sizes = {length: config.rollout, "batch_size": config.argument("batch_size")}

@@ -30,7 +30,7 @@ def draw_learning_curve(path: Path, title: str, evaluations: Sequence[Mapping[st
             axes.fill_between(steps, *bounds, color=BLUE, alpha=0.16, lw=0, label="95% interval")
             axes.plot(steps, values(name), color=BLUE, marker="o", markersize=3, label=label)
             axes.grid(linewidth=0.4)
-        star = {"color": ORANGE, "markersize": 12, "label": f"best.zip ({quality[best][0]:.0%})"}
+        star = {"color": ORANGE, "markersize": 12, "label": f"best.zip ({quality[best][0]:.1%})"}
         upper.plot(steps[best], quality[best][0], "*", **star)
         upper.set(ylim=(-0.02, 1.04), ylabel="successful episodes")
         upper.yaxis.set_major_formatter(PercentFormatter(xmax=1))

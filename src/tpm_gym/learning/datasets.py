@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 import hashlib
-import json
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,6 +34,7 @@ from tpm_gym.learning.configuration import (
     GivenEnvOptions,
     TrainingConfig,
     check_least,
+    check_seed,
     complete,
     unset,
 )
@@ -44,7 +44,6 @@ from tpm_gym.learning.evaluation import bar
 from tpm_gym.learning.policies import NoisyPolicy, load_policy
 from tpm_gym.learning.rollout import (
     BATCH,
-    SELECTION_SEED,
     TEST_SEED,
     Policy,
     Step,
@@ -165,6 +164,8 @@ def collect(config: CollectConfig, console: Console | None = None) -> list[Path]
     envs = _complete(config)
     root = get_dataset_path() if config.out is UNSET else config.out
     todo = [Dataset(config, env, kind, root) for env in envs for kind in config.kind]
+    if "replay" in config.kind:
+        console.print("loading PyTorch ...")
     for dataset in todo:
         if dataset.kind == "replay":
             _ = dataset.training  # raises before anything is written
@@ -193,15 +194,13 @@ def _require_packages(kinds: Sequence[str]) -> None:
 def _complete(config: CollectConfig) -> list[str]:
     """Check the options; return the ids of the environments."""
     check_least(config, 1, "episodes", "steps")
-    check_least(config, 0, "seed", "noise")
+    check_least(config, 0, "noise")
+    check_seed(config.seed, config.episodes)
     for name in ("env", "kind"):
         if getattr(config, name) == ():
             raise ConfigError(f"--{name}: give at least one")
     if not math.isfinite(config.noise):
         raise ConfigError(f"--noise {config.noise}: must be finite")
-    most = SELECTION_SEED - config.episodes
-    if config.seed > most:
-        raise ConfigError(f"--seed {config.seed}: must be at most {most}: later ones are held out")
     if wrong := [kind for kind in config.kind if kind not in KINDS]:
         raise ConfigError(f"--kind {wrong[0]}: there are {', '.join(KINDS)}")
     if config.env is UNSET:
@@ -356,7 +355,7 @@ def _require_free(dataset: Dataset) -> None:
     if not dataset.config.overwrite:
         raise ConfigError(f"{dataset.folder} is there already; give --overwrite, or another --out")
     try:
-        ours = _OURS in json.loads((dataset.folder / _DATA / _METADATA).read_bytes())
+        ours = _OURS in provenance.read_json(dataset.folder / _DATA / _METADATA)
     except (OSError, ValueError):
         ours = False
     if not ours:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import MofNCompleteColumn, Progress
 from rich.table import Table
 
 from tpm_gym.envs.vector import TPMVectorEnv
@@ -151,7 +151,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> list[R
     count = min(config.episodes, BATCH) if config.env_options.in_batches else 1
     with closing(_make_envs(config, count)) as envs:
         # All policies are loaded before the first one runs, so that a mistyped name fails at once.
-        policies = list(zip(config.policy, _load(config, envs), strict=True))
+        policies = [(spec, load_policy(spec, envs)) for spec in config.policy]
         results = [_evaluate_one(envs, *policy, config, console) for policy in policies]
     console.print(_table(config, results))
     if config.json is not None:
@@ -175,10 +175,9 @@ def _check(config: EvaluationConfig) -> None:
 
 
 def _complete(config: EvaluationConfig) -> EvaluationConfig:
-    """Complete the options.
+    """Take env, machine, drive and shield from the policies if they are not given.
 
-    If env, machine, drive or shield is not given, its value is taken from the policies. Goals and
-    penalty weight are then those of the environment id.
+    Goals and penalty weight that are not given are those of the environment id.
     """
     trained = {spec: found for spec in config.policy if (found := trained_in(spec)) is not None}
     if config.env is UNSET:
@@ -236,24 +235,28 @@ def _make_envs(
     return make_envs(config.env, count, **pictures, **options)
 
 
-def _load(config: EvaluationConfig, envs: TPMVectorEnv) -> list[Policy]:
-    return [load_policy(spec, envs) for spec in config.policy]
-
-
 def _evaluate_one(
     envs: TPMVectorEnv, spec: str, policy: Policy, config: EvaluationConfig, console: Console
 ) -> Result:
     """Run the episodes of one policy, with a progress bar on a terminal."""
+    _say_without_bar(console, f"{spec}: {config.episodes:,} episodes")
     start = time.perf_counter()
     with bar(console, spec, config.episodes) as advance:
         records = run_episodes(envs, policy, config.episodes, config.seed, on_episodes=advance)
     return Result(spec, summarise(records), records, time.perf_counter() - start)
 
 
+def _say_without_bar(console: Console, text: str) -> None:
+    """Say what takes a while where no progress bar is shown."""
+    if not console.is_terminal:
+        console.print(f"{text} ...", markup=False, soft_wrap=True)
+
+
 @contextmanager
 def bar(console: Console, text: str, total: int) -> Iterator[Callable[[int], object]]:
     """Show a progress bar on a terminal; yield a function that advances it."""
-    with Progress(console=console, disable=not console.is_terminal) as bar:
+    columns = (*Progress.get_default_columns(), MofNCompleteColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         yield partial(bar.advance, bar.add_task(text, total=total))
 
 
@@ -324,7 +327,7 @@ def _film(config: EvaluationConfig, console: Console) -> None:
     count = min(config.video_episodes, config.episodes)
     frames = 1 + (check_env_id(config.env).max_episode_steps or 0)
     with closing(_make_envs(config, 1, "rgb_array")) as envs:
-        policies = _load(config, envs)
+        policies = [load_policy(spec, envs) for spec in config.policy]
         fps = envs.metadata["render_fps"]
         films: tuple[tuple[str, Path | None, int, Callable[[Path, Play], None]], ...] = (
             ("video", config.video, count, partial(write_video, fps=fps)),
@@ -333,6 +336,7 @@ def _film(config: EvaluationConfig, console: Console) -> None:
         for kind, file, episodes, write in films:
             paths = paths_per_policy(file, config.policy) if file is not None else []
             for path, policy in zip(paths, policies, strict=False):
+                _say_without_bar(console, f"drawing the {kind} {path}")
                 with bar(console, kind, episodes * frames) as advance:
                     write(path, partial(_play, envs, policy, episodes, config.seed, advance))
                 console.print(f"{kind}: {path}", markup=False)

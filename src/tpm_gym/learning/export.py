@@ -1,10 +1,13 @@
 """Export of a trained policy as safetensors and JSON. Loading these files runs no code."""
 
 import io
+import json
 import os
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Mapping
+from contextlib import closing
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
@@ -23,21 +26,27 @@ from typing_extensions import NotRequired, TypedDict
 from tpm_gym import TPMError, load_policy
 from tpm_gym.learning import model_card, provenance
 from tpm_gym.learning.algorithms import ALGORITHMS, NAMES, Actor
-from tpm_gym.learning.environments import named, set_by
+from tpm_gym.learning.configuration import UNSET, EnvOptions
+from tpm_gym.learning.environments import (
+    check_env_id,
+    import_module_of,
+    make_env,
+    named,
+    set_by,
+)
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.features import GoalGapExtractor
-from tpm_gym.learning.policies import refused
+from tpm_gym.learning.policies import exported_in, refused
 from tpm_gym.learning.run_folder import CONFIG_FILE, description
 from tpm_gym.policy.files import FORMAT, VERSION, digest, files
 
 TOLERANCE: Final = 1e-4
-"""Largest error of an exported action, relative to half the action's range.
-
-If half the range is less than 1, the absolute error counts.
+"""Largest error of an exported action, relative to the larger of 1 and half the action's range.
 
 Single precision rounds the actions of networks with large weights by 1e-5. Wrong weights or a wrong
 activation cause far larger errors.
 """
+_NORMALISER: Final = "vecnormalize.pkl"  # name that rl-baselines3-zoo gives it
 _TRIALS: Final = 64
 _ACTIVATIONS: Final = {nn.ReLU: "relu", nn.Tanh: "tanh"}
 
@@ -54,6 +63,43 @@ class _Origin(TypedDict):
     versions: dict[str, Any]
 
 
+def save_policy(
+    model: BaseAlgorithm,
+    path: str | Path,
+    *,
+    env_id: str,
+    env_options: EnvOptions | None = None,
+) -> Path:
+    """Write the policy of a model as safetensors and JSON; return the path of the JSON file.
+
+    :func:`tpm_gym.load_policy` and ``tpm-gym evaluate --policy`` read these files. The model may
+    come from Stable-Baselines3 alone. The spaces of the environment are compared with the model's.
+
+    Args:
+        model: SAC, TQC or PPO with a MultiInputPolicy.
+        path: Path of the files without their endings. An earlier policy is replaced.
+        env_id: Id of the environment of the training.
+        env_options: Machine, engine, drive and shield of the training, where they are not the
+            defaults of ``env_id``.
+
+    Raises:
+        PolicyError: The model has other spaces than the environment, the files cannot hold the
+            policy, or they would replace files that are no policy.
+        ConfigError: There is no such environment, or ``path`` ends in .zip.
+    """
+    path, options = Path(path), (env_options or EnvOptions()).given()
+    check_env_id(env_id)
+    with closing(make_env(env_id, **options)) as env:
+        for kind in ("observation_space", "action_space"):
+            trained, there = getattr(model, kind), getattr(env, kind)
+            if trained != there:
+                problem = (
+                    f"the model has the {kind.replace('_', ' ')} {trained}, {env_id} has {there}"
+                )
+                raise refused(str(path), f"{problem}; give the environment id of its training")
+    return save(model, path, env_id=env_id, seed=model.seed, recipe={}, env_options=options)
+
+
 def save(
     model: BaseAlgorithm,
     path: Path,
@@ -66,10 +112,8 @@ def save(
 ) -> Path:
     """Write the policy of a model; return the path of the JSON file.
 
-    The files are ``path``.safetensors and ``path``.json.
-
-    They get their final names only after a check that the written policy acts like the model.
-    A policy that the files cannot express is therefore refused, not changed.
+    The files ``path``.safetensors and ``path``.json get these names only after a check that the
+    written policy acts like the model. A policy that they cannot express is refused, not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
@@ -149,24 +193,45 @@ def _require_free(path: Path) -> None:
 
 
 def convert(
-    archive: Path, path: Path, *, trust_pickle: bool, evaluation: Path | None = None
+    archive: Path,
+    path: Path,
+    *,
+    trust_pickle: bool,
+    env_id: str = UNSET,
+    env_options: EnvOptions | None = None,
+    evaluation: Path | None = None,
 ) -> Path:
-    """Export ``best.zip`` or ``last.zip`` of a run with :func:`save`, or copy an exported policy.
+    """Export a model of Stable-Baselines3, or copy an exported policy; return the JSON file.
 
     Args:
+        archive: Model (.zip), exported policy (.json), or folder of a run (its best policy).
+        path: Path of the new files without their endings.
+        trust_pickle: Whether a .zip may be loaded, which can run any code.
+        env_id: Environment of the training, for a model outside the folder of a run.
+        env_options: Its machine, engine, drive and shield.
         evaluation: Results for a model card, which are checked before anything is written.
-
-    Returns:
-        The JSON file.
     """
+    if archive.is_dir():
+        found = [file for file in exported_in(archive) if file.is_file()]
+        if not found:
+            missing = " or ".join(file.name for file in exported_in(archive))
+            raise ConfigError(f"MODEL {archive}: holds no {missing}; give the .zip of a model")
+        archive = found[0]
     if not archive.is_file():
-        raise ConfigError(f"MODEL {archive}: no such file; give best.zip or last.zip of a run")
+        valid = "the folder of a run, an exported policy (.json), or a .zip of Stable-Baselines3"
+        raise ConfigError(f"MODEL {archive}: no such file; give {valid}")
     _require_free(path)
     provenance.require_writable("OUT", path)
-    name = str(archive)
+    name, options = str(archive), env_options or EnvOptions()
+    origins = (description(folder) for folder in archive.resolve().parents[:2])
+    config = next(filter(None, origins), None)
+    if archive.suffix == ".json" or config is not None:
+        for option, value in {"env": env_id, **options.given()}.items():
+            if value is not UNSET:
+                there = "is for a .zip outside the folder of a run; leave it out"
+                raise ConfigError(f"--{option} {value}: {there}")
     if archive.suffix == ".json":
-        env_id = load_policy(archive).description.env_id
-        _check_card(path, env_id, evaluation)
+        _check_card(path, load_policy(archive).description.env_id, evaluation)
         for old, new in zip(files(archive), files(path), strict=True):
             provenance.write_whole(new, partial(shutil.copyfile, old))
         return files(path)[0]
@@ -176,10 +241,19 @@ def convert(
             "holds pickles, and loading it can run any code; if you trust its origin, give "
             "--trust-pickle",
         )
-    found = (description(folder) for folder in archive.resolve().parents[:2])
-    if (config := next(filter(None, found), None)) is None:
-        where = f"no {CONFIG_FILE} of a training beside it or above it"
-        raise refused(name, f"{where}; keep the file in its run folder")
+    if config is None:
+        if env_id is UNSET:
+            where = f"no {CONFIG_FILE} of a training beside it or above it"
+            way = "give the environment of its training with --env ID"
+            raise refused(name, f"{where} says where it was trained; {way}")
+        import_module_of(env_id)
+        check_env_id(env_id)
+        for folder in (archive.parent, archive.parent / env_id):
+            if (folder / _NORMALISER).exists():
+                problem = f"normalised observations (VecNormalize), as {folder / _NORMALISER} says"
+                raise refused(name, f"cannot be exported: {problem}")
+        _check_card(path, env_id, evaluation)
+        return save_policy(_load_any(archive), path, env_id=env_id, env_options=options)
     try:
         TypeAdapter(_Origin).validate_python(config, strict=True)
     except ValidationError as error:
@@ -215,6 +289,23 @@ def load_model(archive: Path, algorithm: str) -> BaseAlgorithm:
         return kind.load(archive, device="cpu", custom_objects=unused)
     except Exception as error:  # a damaged archive or pickle can raise anything
         raise refused(str(archive), f"cannot be loaded as {algorithm}: {error}") from error
+
+
+def _load_any(archive: Path) -> BaseAlgorithm:
+    """Unpickle a model whose algorithm is not known; this can run any code.
+
+    An archive does not name its algorithm, and Stable-Baselines3 loads A2C as PPO, and TQC as SAC.
+    The names of the hyperparameters tell them apart.
+    """
+    try:
+        with zipfile.ZipFile(archive) as file:
+            saved = set(json.loads(file.read("data")))
+    except (OSError, zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise refused(str(archive), f"is no archive of Stable-Baselines3: {error}") from error
+    own = {name: row.hyperparameters() for name, row in ALGORITHMS.items()}
+    if not (fitting := [name for name in own if own[name] <= saved]):
+        raise refused(str(archive), f"is of an algorithm that is none of {NAMES}")
+    return load_model(archive, max(fitting, key=lambda name: len(own[name])))
 
 
 def _network(

@@ -16,20 +16,15 @@ _WAY = "`tpm-gym evaluate --policy POLICY --json FILE`, with one policy"
 _ROWS = {
     "success_at_end": "success at the end",
     "return": "return",
-    "unsafe_share": "fraction of the time with unsafe conditioning",
+    "unsafe_share": "fraction of steps with unsafe conditioning",
     "torque_rms": "torque, RMS, N m",
 }
 
 
 def write(policy: Path, evaluation: Path) -> Path:
-    """Write the model card of a policy beside its files; return the path of the card.
+    """Write the model card of an exported policy, given by its JSON file; return the card's path.
 
-    Args:
-        policy: JSON file of an exported policy.
-        evaluation: JSON file of ``tpm-gym evaluate --json`` with one policy.
-
-    Raises:
-        ConfigError: As :func:`check`.
+    ``evaluation`` and errors are those of :func:`check`.
     """
     content = provenance.read_json(policy)
     card = policy.with_suffix(".md")

@@ -140,10 +140,15 @@ def refused(spec: str, problem: str) -> PolicyError:
     return PolicyError(f"policy {spec!r}: {problem}")
 
 
+def exported_in(run: Path) -> list[Path]:
+    """Return the files that may hold the policy of a run, the best policy first."""
+    return [run / "best.json", run / "last.json"]
+
+
 def _exported(spec: str) -> ExportedPolicy:
     path = Path(spec)
     if path.is_dir():
-        candidates = [path / "best.json", path / "last.json"]
+        candidates = exported_in(path)
     elif path.suffix in (".zip", ".json", ".safetensors"):
         candidates = [path]
     else:

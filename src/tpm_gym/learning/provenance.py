@@ -103,11 +103,7 @@ def _portable(word: str) -> str:
 
 
 def require_packages(extras: Mapping[str, str]) -> None:
-    """Raise MissingPackageError if a package is missing.
-
-    Args:
-        extras: For each required package, the extra of tpm_gym that installs it.
-    """
+    """Raise MissingPackageError if a package is missing; ``extras`` names the extra of each."""
     for package, extra in extras.items():
         if find_spec(package) is None:
             raise MissingPackageError(package, extra)

@@ -74,13 +74,7 @@ class Recipe:
 
 
 def _falling(start: float, update: float, remaining: float) -> float:
-    """Return the learning rate of an update.
-
-    Args:
-        start: Learning rate at the start of the training.
-        update: Steps between two updates, as a fraction of all steps.
-        remaining: Steps after this update, as a fraction of all steps.
-    """
+    """Return the learning rate when a fraction ``remaining`` of all steps is left to take."""
     return start * max(0.0, min(1.0, remaining + update))
 
 
@@ -206,7 +200,6 @@ def check_recipes(source: str, recipes: Any, algorithm: str) -> None:
     Args:
         source: File or option that the message names as the origin of the recipes.
         recipes: Entries of each recipe, by name.
-        algorithm: Name of the algorithm.
     """
     entries = ALGORITHMS[algorithm].entries()
     kind: Any = dict[str, entries]  # type: ignore[valid-type]

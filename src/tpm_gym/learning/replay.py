@@ -1,9 +1,7 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
-The algorithm is the one that ``tpm-gym train`` uses without ``--algo``. The policy acts as in
-training, with its exploration. Episodes are spread evenly over the training; if the training
-begins with demonstrations, over the steps after them. The episodes have seeds of their own and do
-not affect the training.
+The policy acts with its exploration. The episodes have seeds of their own and do not affect the
+training. The moments are spread evenly over the steps after the demonstrations, if there are any.
 """
 
 from collections.abc import Callable, Iterator

@@ -75,11 +75,7 @@ class Episode:
     events: Mapping[str, bool] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the episode as plain data.
-
-        The key of ``total_reward`` is ``"return"``. Each event has an entry of its own, whose key
-        is the name of the event.
-        """
+        """Return plain data, with ``total_reward`` as ``"return"`` and an entry for each event."""
         values = {
             "return" if name == "total_reward" else name: value
             for name, value in vars(self).items()

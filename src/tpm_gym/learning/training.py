@@ -10,7 +10,7 @@ import json
 import signal
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -45,7 +45,7 @@ from tpm_gym.learning.errors import (
     PolicyError,
     RunError,
 )
-from tpm_gym.learning.evaluation import EvaluationConfig, evaluate
+from tpm_gym.learning.evaluation import EvaluationConfig, bar, evaluate
 from tpm_gym.learning.recipes import shipped_for
 from tpm_gym.learning.rollout import BATCH, SELECTION_SEED
 from tpm_gym.learning.run_folder import (
@@ -128,8 +128,8 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
     """Continue a run from its last whole checkpoint; return as :func:`train` does.
 
     A run that was killed before its first checkpoint begins again. A finished run is continued only
-    if it is given more steps. If a finished run is given no more steps, it is not trained. A
-    missing learning curve is then drawn, and a missing final test is run.
+    if it is given more steps. Otherwise, a missing learning curve is drawn, and a missing final
+    test is run.
 
     Raises:
         LearningError: There is no such run, it holds a policy but no whole checkpoint, a change is
@@ -160,23 +160,18 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
             )
         changed = resumed(config, stored, content.step if content else 0)
         resumption = {"from_step": content.step if content else 0, **provenance.origin()}
-        changeable = [entry.name for entry in fields(ResumeConfig) if entry.name != "run"]
         description = {
             **stored,
-            **{name: getattr(changed, name) for name in changeable},
+            **{name: getattr(changed, name) for name in _CHANGEABLE},
             "resumed": [*stored.get("resumed", []), resumption],
         }
         return _Session(changed, console, store, description, content).run()
 
 
 def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the configuration ``saved``, with the options of ``newest`` that resuming can change.
+    """Return the configuration ``saved`` in a checkpoint, with changeable options of ``newest``.
 
-    These options differ if an earlier resumption was killed before its first checkpoint.
-
-    Args:
-        saved: Configuration in the checkpoint.
-        newest: Configuration in the folder of the run.
+    ``newest``, in the run folder, differs if a resumption was killed before its first checkpoint.
     """
     given = {name: newest.get(name) for name in _CHANGEABLE}
     return saved | {n: value for n, value in given.items() if isinstance(value, _CHANGEABLE[n])}
@@ -215,13 +210,14 @@ class _Session:
 
     def run(self) -> signal.Signals | None:
         """Train, save and test; return the signal that stopped the training, or None."""
-        config, listener = self.config, SignalListener()
+        config, content, listener = self.config, self.content, SignalListener()
+        self._say_title()
         torch.set_num_threads(config.threads)
         count = min(config.eval_episodes, BATCH) if config.env_options.in_batches else 1
         with ExitStack() as stack:
             training_envs = stack.enter_context(training_envs_of(config))
             envs = stack.enter_context(closing(make_envs(count=count, **config.env_arguments)))
-            bar = stack.enter_context(closing(callbacks.ProgressBar(self.console)))
+            advance = stack.enter_context(bar(self.console, "training", config.steps))
             model = make_model(config, training_envs)
             seconds, earlier = self._begin(model)
             keep = partial(self._keep, run_folder.BEST_FILE)
@@ -231,9 +227,12 @@ class _Session:
             )
             stack.callback(model.logger.close)
             # Checkpointing sets the clock that the callbacks after it read.
-            called: list[BaseCallback] = [checkpointing, bar, evaluation]
+            called: list[BaseCallback] = [checkpointing, callbacks.Progress(advance), evaluation]
             if config.recipe.demonstrations:
                 called.insert(1, Demonstrations(**config.recipe.demonstrations))
+                if content is None:
+                    shown = f"{config.demonstrations:,} demonstrations of the expert"
+                    _say(self.console, f"playing {shown} and learning from them ...")
             with listener.listening():
                 stopped_by = self._learn(model, called, listener)
                 self._keep(run_folder.LAST_FILE, model)
@@ -243,11 +242,18 @@ class _Session:
         self._conclude(stopped_by)
         return stopped_by
 
+    def _say_title(self) -> None:
+        config, content = self.config, self.content
+        start = f"from step {content.step if content else 0:,} to "
+        start = start if "resumed" in self.description else ""
+        _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
+        count, every = config.eval_episodes, config.eval_every
+        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
+
     def _begin(self, model: BaseAlgorithm) -> tuple[float, list[dict[str, Any]]]:
         """Set model, files and logs to the beginning or the checkpoint.
 
-        Returns:
-            Training time so far, s, and the evaluations so far.
+        Return the training time, s, and the evaluations so far.
         """
         config, content, seconds, evaluations = self.config, self.content, 0.0, []
         if content is None:
@@ -258,11 +264,6 @@ class _Session:
                 evaluations = run_folder.checked(content.files.get(EVALUATIONS_FILE, b""))
             training_state.restore_files(config.run, content)
         provenance.write_json(config.run / CONFIG_FILE, self.description)
-        start = f"from step {content.step if content else 0:,} to "
-        start = start if "resumed" in self.description else ""
-        _say(self.console, f"{config.title}, {start}{config.steps:,} steps, in {config.run}")
-        count, every = config.eval_episodes, config.eval_every
-        _say(self.console, f"evaluations: {count:,} episodes each, every {every:,} steps")
         iterations = max(0, model.num_timesteps - config.demonstrated) // config.rollout
         model.set_logger(training_state.make_logger(config.run, content, iterations))
         return seconds, evaluations
@@ -318,8 +319,7 @@ class _Session:
     def complete(self) -> bool:
         """Draw the learning curve and run the final test, if a killed process has not done so.
 
-        Returns:
-            Whether the final test ran.
+        Return whether the final test ran.
         """
         config = self.config
         if not (config.run / CURVE_FILE).exists():

@@ -98,10 +98,7 @@ class EpisodeRecorder(gym.Wrapper[Observation, Action, Observation, Action]):
         return {"seed": self._seed, "rng": self._rng, "dtype": dtype, "actions": self._actions}
 
     def replay(self, episode: Mapping[str, Any]) -> Observation | None:
-        """Repeat an episode; return its last observation.
-
-        Return None if the reset or a step raises a TPMError.
-        """
+        """Repeat an episode; return its last observation, or None if it raises a TPMError."""
         self.unwrapped.np_random.bit_generator.state = episode["rng"]
         try:
             observation, _ = self.reset(seed=episode["seed"])
@@ -161,11 +158,7 @@ def restore_files(run: Path, content: Content) -> None:
 
 
 def restore(model: BaseAlgorithm, content: Content) -> float:
-    """Restore a training in a new algorithm, built with equal arguments.
-
-    Returns:
-        Training time until the checkpoint, s.
-    """
+    """Restore a training in a new algorithm, built with equal arguments; return its time, s."""
     state = json.loads(content.files[STATE])
     TypeAdapter(_State).validate_python(state)
     content.files.get(PROGRESS_FILE, b"").decode("utf-8")
@@ -227,10 +220,7 @@ def _restore_rng(model: BaseAlgorithm, state: Mapping[str, Any]) -> None:
 
 
 def _buffer_arrays(model: BaseAlgorithm) -> dict[str, NDArray[Any]]:
-    """Return the replay buffer's position and views of its filled part, by name.
-
-    If the algorithm has no replay buffer, the dictionary is empty.
-    """
+    """Return the replay buffer's position and views of its filled part; empty without a buffer."""
     buffer = getattr(model, "replay_buffer", None)
     if not isinstance(buffer, DictReplayBuffer):
         return {}

@@ -28,12 +28,12 @@ from tpm_gym.learning.configuration import (
     Randomised,
     TrainingConfig,
     check_least,
+    check_seed,
     complete,
     unset,
 )
 from tpm_gym.learning.environments import make_env
 from tpm_gym.learning.errors import ConfigError
-from tpm_gym.learning.rollout import SELECTION_SEED
 from tpm_gym.learning.run_folder import evaluations
 
 RECIPE_FILE: Final = "recipe.yml"
@@ -93,10 +93,7 @@ class TuneConfig:
 
 
 def tune(config: TuneConfig) -> Path:
-    """Run a search and write the best recipe; Ray Tune prints a table while it runs.
-
-    Returns:
-        The recipe file.
+    """Run a search and write the best recipe; return its file. Ray Tune prints a table meanwhile.
 
     Raises:
         ConfigError: An option is not valid, the folder exists, or no training ended.
@@ -104,7 +101,6 @@ def tune(config: TuneConfig) -> Path:
     """
     provenance.require_packages({"ray": "cluster", "optuna": "cluster"})
     check_least(config, 1, "trials", "jobs", "steps")
-    check_least(config, 0, "seed")
     if (config.jobs or 1) > _MOST_JOBS:
         raise ConfigError(f"--jobs {config.jobs}: must be at most {_MOST_JOBS:,}")
     name = config.env.rpartition(":")[2]
@@ -112,10 +108,9 @@ def tune(config: TuneConfig) -> Path:
     if folder.exists():
         raise ConfigError(f"--folder {folder}: exists; give another")
     shared = {name: getattr(config, name) for name in _SHARED}
+    print("loading PyTorch ...", flush=True)
     base = complete(TrainingConfig(**shared, test_episodes=0))
-    most = SELECTION_SEED - base.envs - config.trials + 1  # of the last training, too
-    if config.seed > most:
-        raise ConfigError(f"--seed {config.seed}: must be at most {most}: later ones are held out")
+    check_seed(config.seed, base.envs + config.trials - 1)  # of the last training, too
     with closing(make_env(**base.env_arguments)):  # refuses an unknown machine or engine
         pass
     provenance.require_writable("--folder", folder)

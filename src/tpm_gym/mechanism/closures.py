@@ -53,18 +53,12 @@ def moving_joints(mechanism: Mechanism) -> list[str]:
 def rates(
     mechanism: Mechanism, places: Mapping[str, Place], name: str, offset: Vector
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate position and orientation of a link by each joint position.
-
-    Args:
-        mechanism: Links and joints.
-        places: Positions and orientations of the links.
-        name: Name of the link.
-        offset: Point of the link, in the link's frame, m.
+    """Differentiate position and orientation of the link ``name`` by each joint position.
 
     Returns:
-        Velocity of the point, m/rad (m/m for a slide), and angular velocity of the link, rad/rad,
-        for unit velocities of the joints. Both are (3, number of joints), with columns in the order
-        of :func:`moving_joints`.
+        Velocity of the point ``offset`` (m, link's frame), m/rad (m/m for a slide), and angular
+        velocity of the link, rad/rad, for unit velocities of the joints. Both are (3, number of
+        joints), with columns in the order of :func:`moving_joints`.
     """
     joints, point = moving_joints(mechanism), places[name].point(offset)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
@@ -97,18 +91,16 @@ def rank_of(values: FloatArray) -> int:
 def require_sound(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
     """Refuse a mechanism unless its three motors move the platform in pure translation.
 
-    Redundant closure equations are allowed; the TPM has one.
-
-    Args:
-        mechanism: Links, joints and closures.
-        joints: Position of each joint by name, rad or m.
+    Redundant closure equations are allowed; the TPM has one. ``joints`` has the position of each
+    joint by name, rad or m.
 
     Raises:
-        ConfigurationError: If a name is missing or not unique; if a link has no mass, or comes
-            before its parent; if a joint or a solid is of an unknown kind; if an axis does not have
-            length 1; if a solid has no positive size; if a loop is open at these joint positions;
-            if the platform turns; if there are not exactly three independent motors; or if the
-            platform can move while the motors stand still.
+        ConfigurationError: If a name is missing or not unique; if a joint has no position; if the
+            first link has a joint, or another link has none; if a link has no mass, or comes before
+            its parent; if a joint or a solid is of an unknown kind; if an axis does not have length
+            1; if a solid has no positive size; if a loop is open at these joint positions; if the
+            platform turns; if there are not exactly three independent motors; or if the platform
+            can move while the motors stand still.
         SingularityError: If the rank of the closures' Jacobian is uncertain at these positions.
     """
     _require_parts(mechanism)
@@ -152,14 +144,7 @@ def _require_parts(mechanism: Mechanism) -> None:
 
 
 def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
-    """Refuse wrong links, and names that are missing or repeated.
-
-    Each link must have a mass. The first link must have no joint; each other link must have a joint
-    to a link that is listed before it. The names of links must be different, and so must the names
-    of joints and the names of closures. Closures, ``platform`` and ``tool`` must refer to existing
-    links, and ``actuated`` to existing joints. ``joints`` must have a position for each moving
-    joint.
-    """
+    """Refuse wrong links, and names that are missing or repeated; see :func:`require_sound`."""
     links, names = [link.name for link in mechanism.links], moving_joints(mechanism)
     held = [link.joint for link in mechanism.links[1:]]
     if mechanism.links[0].joint or None in held:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from numpy.typing import ArrayLike
 
-from tpm_gym.arrays import FloatArray, Vector, finite, finite_points, first_row, numbers, vector
+from tpm_gym.arrays import FloatArray, Vector, explained, finite, finite_points, numbers, vector
 from tpm_gym.errors import ConfigurationError, InputError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import Namespace, Numbers, by_rows, namespace_of
@@ -181,13 +181,10 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Call the function ``text`` for all rows of the arrays ``states``, (..., 3) each.
+        """Return the results of ``text`` for all rows of the arrays ``states``, (..., 3) each.
 
         The first array is theta. The arguments of ``text`` are the configuration at theta, and then
         the rows of the other arrays, in the arrays' order.
-
-        Returns:
-            Results of ``text`` for all rows.
         """
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:
@@ -198,7 +195,7 @@ class EquationOfMotion(ABC):
         table = _side_by_side(states)
         missing, *found = by_rows(results, table)
         if missing.any():
-            raise self._refusal(first_row(table[..., :3], missing != 0))
+            raise explained(self._refusal, table[..., :3], missing != 0)
         return found
 
 

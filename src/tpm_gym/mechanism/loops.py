@@ -34,7 +34,7 @@ _NONE: Final = (0.0, 0.0, 0.0)
 
 
 class Equations(NamedTuple):
-    """Functions of one mechanism, called by the loops over rows; all of them are compilable.
+    """Functions of one mechanism, called by the loops over rows.
 
     Each attribute is given as (arguments) -> results. ``columns[k, j]`` is parameter k of the
     machine to which row j belongs: the lengths come first, then the constants of the dynamics.
@@ -156,8 +156,9 @@ def loops(name: str, few: int, many: int, equations: Equations) -> SimpleNamespa
         name: Name of the mechanism. The compiled functions are kept on disk under this name.
         few: Number of lengths.
         many: Number of lengths and constants of the dynamics.
-        equations: Functions of the mechanism.
+        equations: Functions of the mechanism. Functions that they call must be compilable.
     """
+    compilable(*equations)
     found = SimpleNamespace()
     for size, rows in (few, _kinematics(equations)), (many, _dynamics(equations)):
         for row, width in rows.items():

@@ -21,13 +21,8 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tpm_gym.arrays import BoolArray, FloatArray, Vector, finite, first_row, numbers, points, vector
-from tpm_gym.errors import (
-    ConfigurationError,
-    JointLimitError,
-    SingularityError,
-    UnreachableError,
-)
+from tpm_gym.arrays import BoolArray, FloatArray, Vector, explained, finite, numbers, points, vector
+from tpm_gym.errors import ConfigurationError, JointLimitError, SingularityError, UnreachableError
 from tpm_gym.kinematics.geometry import Geometry
 from tpm_gym.kinematics.workspace import Region
 from tpm_gym.mechanism import virtual_work
@@ -169,6 +164,7 @@ class Machine(ABC):
             theta, left = self._postures(np.array(points))
         except UnreachableError as error:
             error.hint = f"the machine's {name} has to lie within reach of its legs; choose another"
+            error.index = ()  # the caller gave no array of points
             raise
         for point, one, mode in zip(points, theta, left.tolist(), strict=True):
             if mode:
@@ -254,7 +250,7 @@ class Machine(ABC):
         """
         theta = self.inverse(position)
         if np.isnan(theta).any():
-            raise self.unreachable(first_row(np.asarray(position), np.isnan(theta[..., 0])))
+            raise explained(self.unreachable, np.asarray(position), np.isnan(theta[..., 0]))
         return theta
 
     def require_evaluate(self, theta: ArrayLike, built: FloatArray | None = None) -> Reading:
@@ -266,7 +262,7 @@ class Machine(ABC):
         """
         reading = self.evaluate(theta, built)
         if np.isnan(reading.conditioning).any():
-            raise self.unassembled(first_row(np.asarray(theta), np.isnan(reading.conditioning)))
+            raise explained(self.unassembled, np.asarray(theta), np.isnan(reading.conditioning))
         return reading
 
     def require_within_stops(self, theta: ArrayLike) -> None:
@@ -413,8 +409,7 @@ class Machine(ABC):
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
         """Compute boxes around platform and tool: low and high corners, m, world.
 
-        Args:
-            position: Point P (3,) m, machine's frame.
+        ``position`` is point P (3,) m, machine's frame.
         """
         a, b, c = self.require_inverse(vector("position", position)).tolist()
         places = self.mechanism.places(self.joint_positions((a, b, c)))
@@ -433,6 +428,9 @@ _MADE: dict[str, tuple[Any, Machine]] = {}  # callables of registered machines, 
 def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> None:
     """Make a machine available as ``machine=name``; a callable is called at the first use.
 
+    A second call with an equal machine changes nothing. A callable, or a machine of a class, that
+    was defined again, as in a notebook, replaces the old one.
+
     Raises:
         ConfigurationError: If the name is empty or taken by another machine, or if the value is no
             machine.
@@ -441,9 +439,18 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
         raise ConfigurationError("name", name, "a name")
     if not isinstance(machine, Machine) and not callable(machine):
         raise ConfigurationError("machine", machine, "a tpm_gym.Machine, or what makes one")
-    if _MACHINES.get(name, machine) != machine:
+    old = _MACHINES.get(name, machine)
+    if old != machine and not _defined_again(old, machine):
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
     _MACHINES[name] = machine
+
+
+def _defined_again(old: Any, new: Any) -> bool:
+    """Return whether callables, or the classes of machines, are different but have one name."""
+    kinds = [type(value) if isinstance(value, Machine) else value for value in (old, new)]
+    first, second = (getattr(kind, "__qualname__", None) for kind in kinds)
+    same = first == second is not None and kinds[0].__module__ == kinds[1].__module__
+    return same and kinds[0] is not kinds[1]
 
 
 def machine_names() -> tuple[str, ...]:

@@ -47,12 +47,7 @@ def robot(mechanism: Mechanism, mount: Mount, time_step: float) -> Element:
 
     Bodies, joints and colours have the names of the mechanism's links, joints and colours. The
     equality constraint of a closure has the name of the closure. Geoms that collide have the name
-    of their link.
-
-    Args:
-        mechanism: Robot.
-        mount: Mount of the robot.
-        time_step: Time step of the simulation, s. It sets the stiffness of closures and stops.
+    of their link. The simulation's ``time_step`` (s) sets the stiffness of closures and stops.
     """
     root = Element("mujoco", model=mechanism.name)
     add(root, "compiler", angle="radian", autolimits="true")

@@ -105,11 +105,7 @@ def free_platform(solids: tuple[Solid, ...], reach: float) -> list[Link]:
 
     Three slides and three revolutes, with almost no mass between them, let it move freely. So every
     leg can end in loop closures, and every closure connects two branches of the tree. PyBullet's
-    direct solver needs this.
-
-    Args:
-        solids: Solids of the platform.
-        reach: Largest distance from the base's origin to P, m.
+    direct solver needs this. ``reach`` is the largest distance from the base's origin to P, m.
     """
     speck = Solid("box", (_SPECK,) * 3, LEVEL, 1.0, colour="yellow")
     links, parent = [], "base"

@@ -57,9 +57,7 @@ _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i,
 def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
     """Write the spanning tree as URDF, in the machine's frame.
 
-    Args:
-        mechanism: Links, joints and closures.
-        closure_frames: Whether to add two frames for each closure, named in :func:`loops_text`.
+    If ``closure_frames``, add two frames for each closure, which :func:`loops_text` names.
     """
     root = Element("robot", name=mechanism.name)
     root.append(Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))

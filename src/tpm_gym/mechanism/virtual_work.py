@@ -35,7 +35,6 @@ def torque(
     """Compute the motors' torques (3,) N m (N for a slide) for a motion.
 
     Args:
-        mechanism: Bodies.
         joint_positions: Function from the motors' positions to all joint positions.
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
         link_masses: For each moving link, factor by which its mass and inertia are multiplied.

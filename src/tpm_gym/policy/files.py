@@ -168,7 +168,8 @@ def files(path: str | Path) -> tuple[Path, Path]:
         raise PolicyFileError(
             str(path),
             "is an archive of Stable-Baselines3, which holds pickles: loading it can run any code",
-            "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle",
+            "if you trust it, convert it once: tpm-gym export MODEL.zip OUT --trust-pickle, with "
+            "--env ID unless it is in the folder of a run",
         )
     stem = path.with_suffix("") if path.suffix in (".json", ".safetensors") else path
     return Path(f"{stem}.json"), Path(f"{stem}.safetensors")

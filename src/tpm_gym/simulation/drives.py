@@ -127,7 +127,7 @@ class References(NamedTuple):
 
 
 class ServoDrives:
-    """Servo drives of n robots, in an engine with a fixed time step.
+    """Servo drives of n robots, built for a nominal machine and a fixed time step (s).
 
     A real amplifier updates the torque about 10,000 times per second. An engine updates it only a
     few hundred times per second. With the engine's rate and the stiffness of a real axis, a servo
@@ -137,12 +137,6 @@ class ServoDrives:
     last time step minus M times the acceleration in the last time step. The static stiffness equals
     ``stiffness`` under any load. The damping is larger than ``damping`` by ``stiffness`` x
     ``time_step``.
-
-    Args:
-        servo: Parameters of the servo law.
-        machine: Nominal machine.
-        count: Number of robots, n.
-        time_step: Time step of the engine, s.
 
     Attributes:
         memory: (2, n, 3), torques (N m) in the last time step, and joint velocities (rad/s) at its
@@ -159,7 +153,7 @@ class ServoDrives:
         """Initialise the drives with nominal plants, at rest at home."""
         from tpm_gym.simulation import compiled  # imports Numba
 
-        self._step_law, self._braced = compiled.servo_torques, compiled.braced_inverse
+        self._loops = compiled
         if machine.mirror_axis is not None:
             valid = f"'ideal': {machine.name!r} passes a plane in which the inertia is infinite"
             raise ConfigurationError("drive", servo, valid)
@@ -207,17 +201,15 @@ class ServoDrives:
         The feed-forward is computed for the first and the last time step and interpolated linearly,
         because it is almost linear within a control period.
         """
-        from tpm_gym.simulation import compiled  # imports Numba
-
         theta = path.readings()
         steps = theta.shape[1] - 1
         references = References(*np.empty((3, steps, len(theta), 3)))
         torques = np.zeros((2, len(theta), 3))
         if self._servo.feedforward != "none":
-            there, rates, changes = compiled.ends(theta, self._step)
+            there, rates, changes = self._loops.ends(theta, self._step)
             moving = float(self._servo.feedforward == "computed")
             torques = path.machine.torque(there, moving * rates, moving * changes)
-        compiled.along(theta, path.true(theta), torques, self._step, references)
+        self._loops.along(theta, path.true(theta), torques, self._step, references)
         return references
 
     def begin(self, theta: FloatArray) -> None:
@@ -231,7 +223,7 @@ class ServoDrives:
             mass[lost] = self._machine.motion(home, 0.0 * home, built).mass
         mass *= self._lightest
         stiffness, damping = self._stiffness, self._servo.damping
-        inverse = self._braced(mass, stiffness, damping, self._step)
+        inverse = self._loops.braced_inverse(mass, stiffness, damping, self._step)
         self.law = stiffness, damping, mass, inverse, self._effort, self._line
 
     def torque(
@@ -239,12 +231,10 @@ class ServoDrives:
     ) -> FloatArray:
         """Compute the torques (n, 3) N m that the motors apply in a time step.
 
-        Args:
-            references: References of the control period.
-            index: Index of the time step in the control period.
-            theta: (n, 3) rad, joint positions at the beginning of the time step.
-            theta_dot: (n, 3) rad/s, joint velocities at the beginning of the time step.
+        ``index`` is the index of the time step in the control period. ``theta`` (n, 3) rad and
+        ``theta_dot`` (n, 3) rad/s are joint positions and velocities at its beginning.
         """
-        self._step_law(index, references, self.law, theta, theta_dot, self._step, self.memory)
+        step, memory = self._step, self.memory
+        self._loops.servo_torques(index, references, self.law, theta, theta_dot, step, memory)
         torque: FloatArray = self.memory[0]
         return torque

@@ -25,7 +25,7 @@ from tpm_gym.simulation.drives import Servo, ServoDrives
 from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import Plant
 from tpm_gym.simulation.state import Scene
-from tpm_gym.simulation.vacuum import Hold
+from tpm_gym.simulation.vacuum import EMPTY, Hold
 
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 SPRING_GAIN = 0.2
@@ -65,6 +65,13 @@ class Twist(NamedTuple):
 
     velocity: Vector = (0.0, 0.0, 0.0)
     angular_velocity: Vector = (0.0, 0.0, 0.0)
+
+
+class Grip(NamedTuple):
+    """Held object and vacuum, and the held object's pose relative to the cup; None without one."""
+
+    hold: Hold = EMPTY
+    pose: Pose | None = None
 
 
 class Readout(NamedTuple):
@@ -155,7 +162,7 @@ class Path:
     positions would move P away from its path by centimetres.
 
     Args:
-        machine: Nominal machine, used for the inverse kinematics.
+        machine: Nominal machine.
         commands: (n, 3, 3) m, machine's frame: the last three commands, oldest first.
         weights: (K, 3), from :func:`spline_weights`, for the K time steps of the control period.
         bias: (n, 3) rad, encoder reading minus true joint position; None for zero.
@@ -412,15 +419,9 @@ def make_engine(
     drive: Servo | None = None,
     time_step: float | None = None,
 ) -> Engine:
-    """Create the engine with this name.
+    """Create the engine with this name; the options are explained in :class:`.Simulation`.
 
-    Args:
-        name: Name of the engine.
-        gui: Whether to open a window.
-        renderer: Renderer of the pictures; None for the engine's default.
-        physics: Numerical settings of the engine; None for the engine's defaults.
-        drive: Servo drives of the motors; None for ideal drives.
-        time_step: Time step, s, if ``physics`` has none; None for the engine's default.
+    ``time_step`` (s) is used if ``physics`` has none; None for the engine's default.
 
     Raises:
         ConfigurationError: If no engine has this name, or the engine does not support an option.

@@ -82,9 +82,9 @@ class Camera:
         """Unit vectors (3, 3) to the right, up and forward."""
         yaw, pitch = math.radians(self.yaw), math.radians(self.pitch)
         right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        level = np.array([-math.sin(yaw), math.cos(yaw), 0.0])
-        up, forward = np.array([0.0, 0.0, math.cos(pitch)]), np.array([0.0, 0.0, math.sin(pitch)])
-        up, forward = up - math.sin(pitch) * level, forward + math.cos(pitch) * level
+        level, vertical = np.array([-math.sin(yaw), math.cos(yaw), 0.0]), np.array([0.0, 0.0, 1.0])
+        up = math.cos(pitch) * vertical - math.sin(pitch) * level
+        forward = math.sin(pitch) * vertical + math.cos(pitch) * level
         return np.stack([right, up, forward])
 
     @property
@@ -94,11 +94,7 @@ class Camera:
         return eye
 
     def following(self, point_p: FloatArray) -> Camera:
-        """Return the camera with its target in the world frame.
-
-        Args:
-            point_p: (3,) m, place of point P, to which the target may be relative.
-        """
+        """Return the camera with its target in the world frame; ``point_p`` is point P (3,) m."""
         if not self.follows:
             return self
         return replace(self, target=tuple((self.target + point_p).tolist()), follows=False)
@@ -124,8 +120,8 @@ def camera_of(value: Any, machine: Machine) -> Camera:
 
 
 def _named(name: str, machine: Machine) -> Camera:
-    corners = (machine.mount.to_world(point) for point in (machine.region.low, machine.region.high))
-    low, high = np.sort(np.stack([*corners]), axis=0)
+    region = machine.region
+    low, high = np.sort(machine.mount.to_world([region.low, region.high]), axis=0)
     low[2] = TABLE.top
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     x, y, z = middle.tolist()
@@ -188,12 +184,9 @@ def metres(share: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
-    """Paint soft shadows onto the table, straight below bodies.
+    """Paint soft shadows onto the table, straight below bodies, if the picture has a depth.
 
-    Args:
-        picture: Picture with a depth; its colours are changed.
-        view: View of the picture.
-        casters: (k, 4) m: x, y, z (world) and radius of each body.
+    ``casters`` (k, 4) m has x, y, z (world) and radius of each body.
     """
     if picture.depth is None:
         return
@@ -215,11 +208,7 @@ def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
 def paint_markers(picture: Picture, view: View, centres: ArrayLike, radius: float) -> None:
     """Paint goal markers into a picture: translucent spheres that shine through bodies.
 
-    Args:
-        picture: Picture with a depth; its colours are changed.
-        view: View of the picture.
-        centres: (k, 3) m, world.
-        radius: Radius of the spheres, m.
+    ``centres`` (k, 3) and ``radius`` of the spheres are in m, world.
     """
     camera = view.camera
     for centre in np.reshape(centres, (-1, 3)):
@@ -285,10 +274,8 @@ def _rays(view: View, rows: slice, columns: slice) -> tuple[NDArray[Any], NDArra
 def tile(frames: Sequence[NDArray[Any]], columns: int | None = None) -> NDArray[Any]:
     """Put k images of equal shape (height, width, ...) into one image, row by row.
 
-    Args:
-        frames: Images.
-        columns: Number of images in a row; None for about as many columns as rows. Empty places
-            are filled with 0.
+    ``columns`` is the number of images in a row; None for about as many columns as rows. Empty
+    places are filled with 0.
     """
     columns = columns or math.ceil(math.sqrt(len(frames)))
     rows = -(-len(frames) // columns)

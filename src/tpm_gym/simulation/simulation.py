@@ -19,13 +19,7 @@ from tpm_gym.mechanism.cup import CUP
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.mechanism.tpm import PAPER_TPM
 from tpm_gym.simulation.drives import Servo, require_servo
-from tpm_gym.simulation.engine import (
-    Engine,
-    Path,
-    loops,
-    make_engine,
-    spline_weights,
-)
+from tpm_gym.simulation.engine import Engine, Path, loops, make_engine, spline_weights
 from tpm_gym.simulation.imaging import Camera, Picture, View, paint_markers, paint_shadows
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import count_steps

@@ -52,9 +52,7 @@ _ARROWS_APART, _ARROW_LENGTH, _ARROW_HALF_WIDTH, _SLICES = 0.2, 0.05, 0.04, 10  
 def boards(table: tuple[float, float], belt: Belt | None) -> list[tuple[Slab, float, float]]:
     """Return the table, then the belt if there is one, each with its lowest and highest x (m).
 
-    Args:
-        table: Half edge lengths of the table along x and y, m.
-        belt: Belt of the scene.
+    ``table`` has the half edge lengths of the table along x and y, m.
 
     Raises:
         ConfigurationError: If the belt's lowest x is greater than the table's lowest x, or the

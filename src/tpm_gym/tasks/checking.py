@@ -14,8 +14,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import Scene, State
 from tpm_gym.tasks.task import Task
 
-__all__ = ["check"]
-
 _EXAMPLES = 7
 """Number of states with which a task is checked.
 

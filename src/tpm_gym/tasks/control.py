@@ -18,8 +18,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD
 
-__all__ = ["CartesianControl", "Control", "Follower", "JointControl", "make_control"]
-
 _TRIES = 6  # largest number of tries to scale a joint step down to the step limit
 _AIM = 0.9995  # fraction of the step limit that a try aims at
 USABLE = 0.95
@@ -49,10 +47,9 @@ class Control(Protocol):
         """Convert points (n, 3) m to coordinates (n, 3) whose differences are actions."""
 
     def rate(self, points: FloatArray) -> FloatArray:
-        """Return the derivative of P with respect to the action, at points (n, 3) m.
+        """Return the derivatives (n, 3, 3) m of P with respect to the action, at points (n, 3) m.
 
-        Returns:
-            Matrices (n, 3, 3), m. Column j belongs to component j of the action.
+        Column j belongs to component j of the action.
         """
 
 

@@ -18,8 +18,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task, dense
 
-__all__ = ["Conveyor"]
-
 SPEEDS: Final = (0.05, 0.20)
 """Lowest and highest speed of the belt, m/s."""
 LATEST: Final = 1.0
@@ -130,7 +128,7 @@ class Conveyor(Task):
         return (*super().observed(), speed)
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only."""
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), self.top(state)))}

@@ -16,8 +16,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
-__all__ = ["Crossing"]
-
 STRIPE: Final = 0.003
 """Half width of the stripe on the table that shows the plane y = 0, m."""
 
@@ -68,8 +66,7 @@ class Crossing(Task):
         """Move straight to the goal; the velocity is constant except near the two ends."""
         goal = motion.machine.mount.to_paper(motion.goal)
         yield from motion.go([goal], vacuum=False)
-        while True:
-            yield Move(goal, False)
+        yield Move(goal, False)
 
 
 def _stripe(machine: Machine) -> Patch:

@@ -19,8 +19,6 @@ from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task, dense
 from tpm_gym.tasks.timing import timed
 
-__all__ = ["Cycle"]
-
 STROKE: Final = 0.305
 RISE: Final = 0.025
 """Size of P's path, m: P moves up by RISE, by STROKE along x, and down by RISE."""
@@ -172,7 +170,6 @@ class Cycle(Task):
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
         """Return the box of all goals at each end of the path: low, high corner (3,) m, world."""
-        del block
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []
         for end in self._ends.tolist():
@@ -187,7 +184,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return the base class's term, minus min(gap / 10 mm, 1) if the reward is dense."""
+        """Return -gap / 0.1 m - min(gap / 10 mm, 1) if dense; if sparse, the base class's term."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 

@@ -19,8 +19,6 @@ from tpm_gym.errors import ConfigurationError, EpisodeError, InputError
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
-__all__ = ["Expert"]
-
 
 class Expert:
     """Scripted policy for an environment, or for all environments of a vector.

@@ -16,8 +16,6 @@ from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block
 from tpm_gym.tasks.control import Control
 
-__all__ = ["Motion", "Move", "hanging"]
-
 RAMP = 0.120
 """Time from rest to full speed, s."""
 ROUNDING = 1e-5
@@ -34,7 +32,13 @@ SLOW_SPEED = 0.025
 
 
 def hanging(block: Block) -> FloatArray:
-    """Return the vector (3,) m from the centre of a block in the cup to point P."""
+    """Return the vector (3,) m from the centre of a block in the cup to point P.
+
+    Raises:
+        ConfigurationError: If ``block`` is no Block, such as a name.
+    """
+    if not isinstance(block, Block):
+        raise ConfigurationError("block", block, "a tpm_gym.simulation.Block, not its name")
     return np.array([0.0, 0.0, block.height / 2 + CUP.length])
 
 
@@ -168,7 +172,6 @@ class Motion:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
 
         Args:
-            block: The block.
             clearance: Height over the block from where P comes down, m.
             gently: Whether P stops above the block, and then comes down slowly until the cup seals.
                 Otherwise the cup presses the block on the table.
@@ -188,7 +191,7 @@ class Motion:
 
     def _above(self, block: Block, clearance: float) -> FloatArray:
         """Return P (3,) m, machine's frame, at which the lip is ``clearance`` m above a block."""
-        place = self._see(block.name, "position") + hanging(block)
+        place = hanging(block) + self._see(block.name, "position")
         return self.machine.mount.to_paper(place + (0.0, 0.0, clearance))
 
     def trapezoid(self, start: FloatArray, stop: FloatArray) -> FloatArray:

@@ -14,8 +14,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Task, dense
 
-__all__ = ["PickAndPlace"]
-
 CLEARANCE = 0.028
 """Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 
@@ -65,7 +63,7 @@ class PickAndPlace(Task):
         return {"object": [table], "goal": [table, air]}
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only."""
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), self.top(state)))}
@@ -90,16 +88,10 @@ class PickAndPlace(Task):
             yield from motion.go(stops, vacuum=True, while_holding=self.block.name)
             if motion.holding():
                 break
-        yield from self._finish(motion, place, place + up, release=on_table)
-
-    def _finish(
-        self, motion: Motion, place: FloatArray, above: FloatArray, release: bool
-    ) -> Iterator[Move]:
-        """Release the block and move away, or hold it in the air."""
         for _ in range(2):  # the platform lags its command
             yield Move(place, True)
-        if release:
+        if on_table:
             yield Move(place, False)
-            yield from motion.go([above], vacuum=False)
-            place = above
-        yield Move(place, not release)
+            place = place + up
+            yield from motion.go([place], vacuum=False)
+        yield Move(place, not on_table)

@@ -16,8 +16,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Entry, Task, dense
 
-__all__ = ["Push"]
-
 CLEARANCE: Final = 0.008
 """Gap between lip and block, m: first above the block's top, then beside the pushed face."""
 SHORTEST: Final = 0.060
@@ -114,7 +112,7 @@ class Push(Task):
         return (*self.robot_entries(), *self.object_entries(turn=True))
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only."""
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(self.gap(self.lip(state), state.object_position[:, 0]))}

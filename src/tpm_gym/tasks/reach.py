@@ -11,8 +11,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move
 from tpm_gym.tasks.task import Task
 
-__all__ = ["Reach"]
-
 
 class Reach(Task):
     """Bring point P of the platform to a point in the workspace.

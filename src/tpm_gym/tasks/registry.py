@@ -9,8 +9,6 @@ from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine, find_machine
 from tpm_gym.tasks.task import Task
 
-__all__ = ["TASKS", "make_task", "option_name"]
-
 TASKS: dict[str, type[Task]] = {}
 """Classes of the registered tasks by name; :func:`tpm_gym.register_task` fills it."""
 
@@ -30,8 +28,7 @@ def make_task(task: Any, machine: str | Machine | None = None, **options: Any) -
     """Make a task from its name or class, or return the task itself.
 
     Args:
-        task: Name, class or task.
-        machine: The machine; None for the paper's machine.
+        machine: Machine or its name; None for the paper's machine.
         options: Options of :class:`Task`; None keeps a default.
 
     Raises:

@@ -65,10 +65,8 @@ def safe_points(
 
     Args:
         rngs: One generator for each of the r robots.
-        machine: Machine that defines the safe points.
         regions: For each name, the region of its point, or several regions that are equally likely.
         known: Given points by name, (3,) or (r, 3) m each. They are not drawn.
-        apart: Smallest distance, m.
         near_singularity: Whether the points must be just above the threshold of safe conditioning.
 
     Returns:
@@ -117,8 +115,6 @@ def safe_draw(
     The way of a point is a sequence of straight lines along which P will move.
 
     Args:
-        rng: Generator of the episode that will start.
-        machine: The machine.
         goals: ``"tempting"`` if the lowest conditioning on the way must be just above the threshold
             of safe conditioning.
         draw: Function that draws any number d of points, (d, 3).
@@ -169,7 +165,6 @@ def tempting(
 
     Args:
         rngs: One generator for each of the r robots.
-        machine: The machine.
         start: Region of the starts, or the start itself.
         goals: Equally likely regions of the goals.
 

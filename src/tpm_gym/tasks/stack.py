@@ -14,8 +14,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Task, dense
 
-__all__ = ["Stack"]
-
 CLEARANCE: Final = 0.045
 """Height over start and goal, m: the cup comes down from this height, and goes up to it again.
 
@@ -69,7 +67,7 @@ class Stack(Task):
         return largest
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to the upper block, for a dense reward only."""
+        """Return minus half the distance from cup to upper block / 0.1 m, for a dense reward."""
         if self.reward == "sparse":
             return {}
         return {"approach": 0.5 * dense(super().gap(self.lip(state), self.top(state, 1)))}

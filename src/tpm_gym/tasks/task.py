@@ -28,12 +28,7 @@ from tpm_gym.simulation.engine import loops
 from tpm_gym.simulation.state import CONTROL_PERIOD, Block, Scene, State
 from tpm_gym.tasks.motion import Motion, Move, hanging
 
-__all__ = ["Entry", "Task", "dense"]
-
 Values = tuple[float, ...]
-
-GOAL_BOUND = 2.0
-"""Largest coordinate of a goal in observations, m; larger ones would be clipped."""
 
 _ZERO = (0.0, 0.0, 0.0)
 _LIP = np.array(CUP.lip)
@@ -73,8 +68,8 @@ class Task(ABC):
 
     Args:
         machine: Machine that performs the task.
-        reward: ``"sparse"`` (0 where the goal is achieved, else -1) or ``"dense"`` (minus the
-            distance in units of 0.1 m).
+        reward: Goal term: ``"sparse"`` (0 where the goal is achieved, else -1) or ``"dense"``
+            (minus the distance in units of 0.1 m). The terms of :meth:`shaping` are added to both.
         goals: Name of the sampling of goals and starts, one of :attr:`samplings`.
         penalty_weight: Weight of the singularity penalty; 0 switches it off.
 
@@ -189,8 +184,8 @@ class Task(ABC):
                 result contains them unchanged, and sampled positions keep clear of them.
 
         Returns:
-            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. With a
-            belt, also ``"belt_speed"`` (r, 1) m/s.
+            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m, from
+            -2 to 2 m, as the observation space. With a belt, also ``"belt_speed"`` (r, 1) m/s.
         """
 
     def achieved(self, state: State) -> FloatArray:
@@ -211,7 +206,6 @@ class Task(ABC):
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
         """Return weighted terms of the reward that do not depend on the goal: name -> (n,)."""
-        del state
         return {}
 
     def observed(self) -> tuple[Entry, ...]:
@@ -220,12 +214,10 @@ class Task(ABC):
         return (*self.robot_entries(), *chain(*objects))
 
     def departures(self, goals: FloatArray) -> FloatArray | None:
-        """Return the starts of P in episodes with ``goals`` (r, goal_size) m, world.
+        """Return the starts of P (r, 3) m, machine's frame, for goals (r, goal_size) m, world.
 
-        Returns:
-            (r, 3) m, machine's frame; None for the machine's home.
+        None stands for the machine's home.
         """
-        del goals
         return None
 
     # -- reward: here and nowhere else ------------------------------------------------------------
@@ -289,10 +281,7 @@ class Task(ABC):
     def start(
         self, rngs: Sequence[np.random.Generator], options: Any = None
     ) -> dict[str, FloatArray]:
-        """Sample the starts of r episodes, and apply ``reset(options=...)``.
-
-        Returns:
-            As :meth:`sample`.
+        """Sample the starts of r episodes as :meth:`sample`, and apply ``reset(options=...)``.
 
         Raises:
             ResetOptionError: If an option is unknown, is not a finite array of the right shape, or
@@ -313,15 +302,11 @@ class Task(ABC):
                 valid = f"chosen[{name!r}], {given[name][0].tolist()}, as the user chose it"
                 raise ConfigurationError(label, starts[name][0].tolist(), valid)
         self._check_free(starts, chosen)
-        self._check_goals(starts["goal"])
+        self._check_departures(starts["goal"])
         return starts
 
-    def _check_goals(self, goals: FloatArray) -> None:
-        """Raise if goals are farther than :data:`GOAL_BOUND`, or if P cannot depart as they say."""
-        far = np.abs(goals).max(axis=1) > GOAL_BOUND
-        if far.any():
-            valid = f"within {GOAL_BOUND:g} m of the origin along each axis, world frame, in m"
-            raise ConfigurationError("sample()['goal']", goals[far][0].tolist(), valid)
+    def _check_departures(self, goals: FloatArray) -> None:
+        """Raise if P cannot start as :meth:`departures` says."""
         if (departures := self.departures(goals)) is not None:
             region = self.machine.region
             points = finite("departures()", departures, (len(goals), 3), ConfigurationError)
@@ -338,33 +323,28 @@ class Task(ABC):
 
     def _chosen(self, options: Any) -> dict[str, FloatArray]:
         """Check the user's options, and return their values by name."""
-        objects = self.scene.objects
-        known: dict[str, tuple[int, tuple[Block | None, ...]]] = {
-            **{block.name: (3, (block,)) for block in objects},
-            "goal": (self.goal_size, objects or (None,)),
+        objects, belt = self.scene.objects, self.scene.belt
+        blocks: dict[str, tuple[Block | None, ...]] = {
+            **{block.name: (block,) for block in objects},
+            "goal": objects or (None,),
         }
-        belt = self.scene.belt
-        names = [*known] if belt is None else [*known, "belt_speed"]
-        valid = f"a dictionary with keys among {', '.join(map(repr, names))}"
+        valid = f"a dictionary with keys among {', '.join(map(repr, self._sizes))}"
         if not isinstance(options, Mapping):
             raise ResetOptionError("options", options, valid)
         chosen: dict[str, FloatArray] = {}
         for name, value in options.items():
-            if belt is not None and name == "belt_speed":
-                chosen[name] = belt.require(
-                    numbers("belt_speed", value, ResetOptionError).reshape(-1), 1, ResetOptionError
-                )
-                continue
-            if name not in known:
+            if name in blocks:
+                chosen[name] = self._within_reach(name, value, blocks[name])
+            elif belt is not None and name == "belt_speed":
+                speed = numbers(name, value, ResetOptionError).reshape(-1)
+                chosen[name] = belt.require(speed, 1, ResetOptionError)
+            else:
                 raise ResetOptionError(str(name), value, valid)
-            chosen[name] = self._within_reach(name, value, *known[name])
         return chosen
 
-    def _within_reach(
-        self, name: str, value: Any, size: int, blocks: tuple[Block | None, ...]
-    ) -> FloatArray:
+    def _within_reach(self, name: str, value: Any, blocks: Sequence[Block | None]) -> FloatArray:
         """Copy points (size,) m that a user chose for P or for blocks; raise if out of reach."""
-        points = np.array(finite(name, value, (size,), ResetOptionError))
+        points = np.array(finite(name, value, (self._sizes[name],), ResetOptionError))
         for point, block in zip(points.reshape(-1, 3), cycle(blocks), strict=False):
             boxes = self.goals_of(block) if name == "goal" else [self.starts_of(block)]
             margin = max(float(np.minimum(point - low, high - point).min()) for low, high in boxes)
@@ -374,20 +354,13 @@ class Task(ABC):
         return points
 
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
-        """Return the low and high corners (3,) m of the places where a block may start.
-
-        The default is :meth:`reach_of`. A task with other starts overrides this method.
-        """
+        """Return low and high corner (3,) m of the starts of a block; default: :meth:`reach_of`."""
         return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the boxes in which goals lie, as low and high corners (3,) m each.
+        """Return the boxes of a block's goals, or of P's for None; by default :meth:`reach_of`.
 
-        By default there is one box: the reach of point P, or of a block in the cup. A task with
-        goals elsewhere overrides this method.
-
-        Args:
-            block: Block that has to reach the goals; None for goals of point P.
+        Each box is a pair of low and high corner (3,) m.
         """
         return [self.reach_of(block)]
 
@@ -460,24 +433,14 @@ class Task(ABC):
         """
         centre, extent, speed, _ = self._scales()
         name, near = self.scene.objects[index].name, tuple(min(0.1, max(0.02, e)) for e in extent)
+        flat, unit = (0.0, 0.0), (1.0, 1.0)
+        gauge = f"vacuum, measured by a gauge, 0 to 1; 0 if the {name} is not held"
         rows: tuple[tuple[str, str, str, Values, Values], ...] = (
             ("position", "m", f"centre of the {name}, from a camera", centre, extent),
             ("offset", "m", f"top of the {name} minus lip of the cup", _ZERO, near),
             ("velocity", "m/s", f"velocity of the {name}, from a camera", _ZERO, speed),
-            (
-                "tilt",
-                "-",
-                f"x and y of the unit vector along the {name}'s z axis",
-                (0.0, 0.0),
-                (1.0, 1.0),
-            ),
-            (
-                "held",
-                "-",
-                f"vacuum, measured by a gauge, 0 to 1; 0 if the {name} is not held",
-                (0.5,),
-                (0.5,),
-            ),
+            ("tilt", "-", f"x and y of the unit vector along the {name}'s z axis", flat, unit),
+            ("held", "-", gauge, (0.5,), (0.5,)),
         )
         ends = np.cumsum([9 + 12 * index, *(len(row[-1]) for row in rows)]).tolist()
         entries = tuple(
@@ -489,7 +452,7 @@ class Task(ABC):
         if not turn:
             return entries
         meaning, source = f"cosine and sine of 4 times the yaw of the {name}", partial(_turn, index)
-        return (*entries, Entry(f"{name}_turn", "-", meaning, (0.0, 0.0), (1.0, 1.0), source))
+        return (*entries, Entry(f"{name}_turn", "-", meaning, flat, unit, source))
 
     def _measure(self, state: State) -> FloatArray:
         """Return the measurements (n, 9 + 12 k): 9 of the robot, and 12 of each of k objects."""

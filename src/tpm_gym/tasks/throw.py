@@ -17,8 +17,6 @@ from tpm_gym.tasks import sampling
 from tpm_gym.tasks.motion import Motion, Move, hanging
 from tpm_gym.tasks.task import Task, dense
 
-__all__ = ["Throw"]
-
 NEAREST: Final = 0.040
 FARTHEST: Final = 0.150
 """Bounds (NEAREST, FARTHEST) of the distance of goals from the region's end along x, m."""
@@ -142,7 +140,7 @@ class Throw(Task):
         return paper
 
     def shaping(self, state: State) -> dict[str, FloatArray]:
-        """Return minus half the distance from cup to block, for a dense reward only.
+        """Return minus half the distance from cup to block / 0.1 m, for a dense reward only.
 
         It is 0 if the block is out of reach, because the block has then been thrown.
         """

@@ -17,8 +17,6 @@ from tpm_gym.arrays import FloatArray
 from tpm_gym.errors import ConfigurationError
 from tpm_gym.mechanism.machine import Machine
 
-__all__ = ["timed"]
-
 _STEPS: Final = 50
 _TOLERANCE: Final = 1e-9
 """Relative decrement of the objective at which the search ends."""

@@ -5,6 +5,7 @@ The viewer needs the extra ``view``. Importing this package does not import vise
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,10 +41,7 @@ def open_viewer(
 ) -> Viewer:
     """Start a viewer in the background; ``.address`` is its page and ``.close()`` ends it.
 
-    Args:
-        machine: Name of a machine, or a machine.
-        host: Address to listen on.
-        port: Port to listen on; if it is taken, the next free one.
+    Arguments are those of :class:`ViewConfig`; ``machine`` may also be a ``Machine``.
 
     Raises:
         MissingPackageError: If viser is not installed.
@@ -55,13 +53,9 @@ def open_viewer(
 
 
 def run(config: ViewConfig) -> None:
-    """Run ``tpm-gym view``: serve until Ctrl-C, or export a page.
-
-    Raises:
-        MissingPackageError: If viser is not installed.
-        ConfigurationError: If no machine has this name, or an option is not possible.
-    """
+    """Run ``tpm-gym view``: serve until Ctrl-C, or export a page; errors as :func:`open_viewer`."""
     if config.export is not None:
+        print("playing an episode for the page ...", file=sys.stderr, flush=True)
         from tpm_gym.viewer.export import export
 
         print(export(config.export, config.machine))

@@ -32,6 +32,7 @@ class Explore:
     Attributes:
         posture: The posture that is shown.
         problem: Reason why the requested posture does not exist; empty if it exists.
+        refusal: Message in the panel with the reason.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class Explore:
         self._add_modes(server.gui)
         self._add_motors(server.gui)
         # Last in the panel, so that a message that appears moves no control.
-        self._refusal: Any = server.gui.add_html("")
+        self.refusal: Any = server.gui.add_html("")
 
     def _add_modes(self, gui: GuiApi) -> None:
         self.operation: Any = gui.add_dropdown("Operation", ("",))
@@ -145,16 +146,8 @@ class Explore:
         self.problem = problem
         style = "color:#c0392b;padding:0.5em 1em;font-size:0.85em"
         said = f'<div style="{style}"><b>No such posture.</b> {escape(problem)}</div>'
-        if self.text != (text := said if problem else ""):
-            self._refusal.content = text
-
-    @property
-    def text(self) -> str:
-        """Message in the panel, as HTML, that says why the requested posture does not exist.
-
-        The message is empty if the posture exists.
-        """
-        return str(self._refusal.content)
+        if self.refusal.content != (text := said if problem else ""):
+            self.refusal.content = text
 
     def _attempt(self, solve: Callable[[], Posture]) -> None:
         try:

@@ -17,24 +17,18 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 _ENV: Final = "TPMPickAndPlace-v0"
+_SEED: Final = 2
 _HOLD: Final = 0.8
 """Time for which the first and the last posture stay, s."""
 _OURS: Final = "__VISER_EMBED_DATA__="
 """Text in every page that viser wrote; a page without this text is not replaced."""
 
 
-def export(folder: str | Path, machine: str | Machine = "paper", seed: int = 2) -> Path:
-    """Write ``index.html``: an episode of pick-and-place by the expert, in a loop.
+def export(folder: str | Path, machine: str | Machine) -> Path:
+    """Write ``index.html``, an episode of pick-and-place by the expert in a loop; return its path.
 
-    The page holds everything it needs. The engine is the analytic one.
-
-    Args:
-        folder: Folder of the page; made if missing. An earlier page is replaced.
-        machine: Name of a machine, or a machine.
-        seed: Seed of the episode.
-
-    Returns:
-        Path of the page.
+    The page holds everything it needs. The engine is the analytic one. The folder is made if it is
+    missing. An earlier page is replaced.
 
     Raises:
         ConfigurationError: If no machine has this name, the machine cannot do the task, the folder
@@ -46,7 +40,7 @@ def export(folder: str | Path, machine: str | Machine = "paper", seed: int = 2) 
         page = _page(Path(folder))
         running = server.start("127.0.0.1", 0)
         try:
-            page.write_text(_recording(running, kind, player, seed), "utf-8", newline="\n")
+            page.write_text(_recording(running, kind, player), "utf-8", newline="\n")
         finally:
             server.stop(running)
     finally:
@@ -54,7 +48,7 @@ def export(folder: str | Path, machine: str | Machine = "paper", seed: int = 2) 
     return page
 
 
-def _recording(running: ViserServer, kind: Kind, player: Player, seed: int) -> str:
+def _recording(running: ViserServer, kind: Kind, player: Player) -> str:
     """Return the page of an episode."""
     set_camera(running, kind.machine)
     robot = RobotScene(running.scene, kind.machine)
@@ -64,7 +58,7 @@ def _recording(running: ViserServer, kind: Kind, player: Player, seed: int) -> s
         robot.draw(kind.of_state(player.state).places)
         robot.draw_objects(player.state, player.markers)
 
-    player.reset(seed)
+    player.reset(_SEED)
     draw()
     recording = running.get_scene_serializer()
     recording.insert_sleep(_HOLD)

@@ -33,10 +33,7 @@ class Mesh(NamedTuple):
 def surface(factor: str, mode: WorkingMode, geometry: Geometry) -> Mesh:
     """Return the part of the singular surface of a factor that a working mode reaches.
 
-    Args:
-        factor: One of :data:`tpm_gym.analysis.singularity.FACTORS`.
-        mode: The working mode.
-        geometry: Link lengths.
+    ``factor`` is one of :data:`tpm_gym.analysis.singularity.FACTORS`.
     """
     flat = factor in ("sin_beta", "cos_beta")
     if flat:

@@ -39,6 +39,8 @@ class Play:
     Attributes:
         player: Player of the episode. None before the first episode, and after another machine,
             environment, engine or policy is chosen.
+        plots: Plots of the reward terms, and of the torques; one plot of each is visible.
+        status: Line below the buttons.
     """
 
     def __init__(
@@ -62,10 +64,10 @@ class Play:
         self.seed: Any = gui.add_number("Seed", 0, min=0, step=1)
         self.speed = gui.add_slider("Speed", *_SPEEDS, 0.1, 1.0, hint="1 is real time")
         self.buttons = gui.add_button_group("", ("Play", "Pause", "Step", "Next"))
-        self._status: Any = gui.add_html("")
+        self.status: Any = gui.add_html("")
         self._gui = gui
-        self._plots: list[dict[Any, GuiUplotHandle]] = [{}, {}]
-        self._folders = [gui.add_folder(None) for _ in self._plots]
+        self.plots: list[dict[Any, GuiUplotHandle]] = [{}, {}]
+        self._folders = [gui.add_folder(None) for _ in self.plots]
         self._connect()
 
     def _connect(self) -> None:
@@ -202,7 +204,7 @@ class Play:
         removed, because a page may still have to process updates of them.
         """
         key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
-        plots = self._plots[place]
+        plots = self.plots[place]
         for other, plot in plots.items():
             if plot.visible != (other == key):
                 plot.visible = other == key
@@ -226,16 +228,6 @@ class Play:
                 },
             )
 
-    @property
-    def plots(self) -> list[GuiUplotHandle]:
-        """Visible plots: one plot of the reward terms, and one plot of the torques."""
-        return [plot for plots in self._plots for plot in plots.values() if plot.visible]
-
-    @property
-    def status(self) -> str:
-        """The line below the buttons, as HTML."""
-        return str(self._status.content)
-
     def tell(self, text: str) -> None:
         """Show a line below the buttons."""
-        self._status.content = f'<div style="padding:0 1em 0.5em;font-size:0.85em">{text}</div>'
+        self.status.content = f'<div style="padding:0 1em 0.5em;font-size:0.85em">{text}</div>'

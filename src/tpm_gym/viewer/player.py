@@ -75,9 +75,6 @@ class Player:
     """An environment and a policy that acts in it.
 
     Args:
-        env_id: Id of the environment.
-        engine: Name of the engine.
-        machine: The robot.
         policy: ``expert``, ``random``, the id of a published policy, or the path of an exported
             one.
 
@@ -122,7 +119,6 @@ class Player:
 
     def _draw(self, observation: Any) -> Any:
         """Return a uniform action; the draws of an episode depend on its seed alone."""
-        del observation
         space: Any = self._env.action_space
         return self._rng.uniform(space.low, space.high).astype(space.dtype)
 

@@ -50,7 +50,6 @@ class RobotScene:
 
     Args:
         scene: Scene of a viser server or client.
-        machine: The robot.
 
     Attributes:
         links: Nodes of the links by name, below :data:`ROBOT`.

@@ -80,7 +80,7 @@ def energy_gained(time_step: float, payload: float) -> FloatArray:
     start, count = at_rest(theta), round(0.08 / time_step)
     course = at_rest(theta, payload)._replace(force=weight)
     slack = IdealSteps(np.zeros((count, 2, 3)), np.zeros((2, 3)), time_step)
-    course, _ = march(PAPER_TPM, None, slack, count, course, time_step, touch)
+    course, _ = march(PAPER_TPM, None, slack, count, course, touch)
     kinetic, _ = after = energy(course)
     assert (kinetic > 0.05).all()
     return sum(after) - sum(energy(start))
@@ -98,7 +98,7 @@ def test_motors_with_torque_to_spare_are_where_they_shall_be():
     theta = PAPER_TPM.inverse(np.linspace(HOME, HOME + (0.03, 0.01, -0.03), 14))[:, None]
     course = at_rest(theta[1])._replace(rates=(theta[1] - theta[0]) / STEP)
     steps = IdealSteps(theta[2:], np.full((1, 3), 1e6), STEP)
-    course, torques = march(PAPER_TPM, None, steps, 12, course, STEP, untouched)
+    course, torques = march(PAPER_TPM, None, steps, 12, course, untouched)
     rates = np.diff(theta, axis=0) / STEP
     expected = PAPER_TPM.torque(theta[1:-1], rates[:-1], np.diff(rates, axis=0) / STEP)
     np.testing.assert_allclose(torques, expected, atol=1e-8)

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tpm_gym.arrays import FloatArray, Vector, first_row, is_number, vector
+from tpm_gym.arrays import FloatArray, Vector, explained, is_number, vector
 from tpm_gym.errors import ConfigurationError, SingularityError, UnreachableError
 from tpm_gym.kinematics.equations import Triple
 from tpm_gym.kinematics.namespaces import NUMPY
@@ -72,7 +72,7 @@ class Delta(CompiledMachine):
         theta = kinematics.inverse_all(points, self.geometry)[..., slot, :]
         lost = np.isnan(theta[..., 0])
         if lost.any():
-            raise self.unreachable(first_row(points, lost))
+            raise explained(self.unreachable, points, lost)
         side = ASSEMBLY_MODES.index(self.assembly_mode)
         there = kinematics.forward_all(theta, self.geometry)[..., side, :]
         left: NDArray[np.int8] = np.abs(there - points).max(axis=-1) > SAME_PLACE

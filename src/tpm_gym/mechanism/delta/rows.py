@@ -26,13 +26,8 @@ compilable(
     equations.pose_at,
     equations.pose_of,
     equations.rod,
-    equations.regular,
     equations.resolve,
-    equations.velocity,
     dynamics.legs,
-    dynamics.torques,
-    dynamics.gather,
-    dynamics.masses,
     dynamics._drift,
     dynamics._inertial,
     dynamics._along,
@@ -84,23 +79,6 @@ def _same_side(pose: Pose, point: Triple, modes: Modes, g: DeltaLengths) -> bool
     return side
 
 
-compilable(_modes, _lengths, _inertia, _posture, _pose, _position, _same_side)
-LOOPS = loops(
-    "delta",
-    5,
-    21,
-    Equations(
-        _modes,
-        _lengths,
-        _inertia,
-        _posture,
-        _pose,
-        _position,
-        equations.regular,
-        equations.velocity,
-        _same_side,
-        dynamics.torques,
-        dynamics.gather,
-        dynamics.masses,
-    ),
-)
+_KINEMATICS = _modes, _lengths, _inertia, _posture, _pose, _position, equations.regular
+_DYNAMICS = dynamics.torques, dynamics.gather, dynamics.masses
+LOOPS = loops("delta", 5, 21, Equations(*_KINEMATICS, equations.velocity, _same_side, *_DYNAMICS))

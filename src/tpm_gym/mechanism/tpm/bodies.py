@@ -235,7 +235,6 @@ def _by_joint(
         theta: Angles of the motors, rad.
         rods: Vectors (x, y, z) along rods 4a, 4b, 6 and 11, m.
         beta: Angle of link 7 about z, rad.
-        g: Link lengths.
         turn: Rotation of link 3' and the platform about y, rad. Joints R23 and R33 turn about
             -y.
     """

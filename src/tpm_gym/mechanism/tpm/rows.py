@@ -18,9 +18,6 @@ from tpm_gym.mechanism.tpm.inertia import Inertia
 
 compilable(
     dynamics.pose_at,
-    dynamics.torques,
-    dynamics.masses,
-    dynamics.velocity,
     dynamics.velocities,
     dynamics.accelerations,
     dynamics.gather,
@@ -80,7 +77,6 @@ def _gather(pose: Pose, force: Triple) -> Triple:
     return dynamics.gather(pose, (0.0, 0.0), force)
 
 
-_OWN = _modes, _lengths, _inertia, _posture, _pose, _position, _regular
-compilable(*_OWN, _same_side, _gather)
+_KINEMATICS = _modes, _lengths, _inertia, _posture, _pose, _position, _regular
 _DYNAMICS = dynamics.torques, _gather, dynamics.masses
-LOOPS = loops("tpm", 7, 23, Equations(*_OWN, dynamics.velocity, _same_side, *_DYNAMICS))
+LOOPS = loops("tpm", 7, 23, Equations(*_KINEMATICS, dynamics.velocity, _same_side, *_DYNAMICS))

@@ -21,12 +21,7 @@ import numpy as np
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.analytic.contact import Contact, Route
-from tpm_gym.simulation.analytic.forward_dynamics import (
-    Course,
-    IdealSteps,
-    ServoSteps,
-    march,
-)
+from tpm_gym.simulation.analytic.forward_dynamics import Course, IdealSteps, ServoSteps, march
 from tpm_gym.simulation.analytic.passage import pass_through
 from tpm_gym.simulation.analytic.physics import Physics
 from tpm_gym.simulation.drives import Servo, ServoDrives
@@ -104,7 +99,6 @@ class AnalyticEngine:
         self._exact = True  # whether bias and length errors are 0, so that P is on its spline
         self._nominal_effort = np.array([motor.effort for motor in machine.mechanism.motors])
         self._effort = np.tile(self._nominal_effort, (count, 1))
-        self._bias = np.zeros((count, 3))
         servo, step = self._servo, self.time_step
         self._contact = Contact(
             scene.objects, count, step, machine.table, machine.mount.plain_frame, scene.belt
@@ -236,7 +230,7 @@ class AnalyticEngine:
         built = None if self._built is None else self._built[rows]
         # pass_through() needs ideal drives; ServoDrives rejects machines with a mirror_axis.
         go: Any = march if self._machine.mirror_axis is None else pass_through
-        course, torques = go(self._machine, built, steps, count, course, self.time_step, touch)
+        course, torques = go(self._machine, built, steps, count, course, touch)
         for name, values in zip(_COURSE, course, strict=True):
             getattr(self, name)[rows] = values
         if self.physics.torques == "every":

@@ -39,23 +39,17 @@ class Course(NamedTuple):
 
 
 class IdealSteps:
-    """Ideal drives with limited torques.
-
-    Args:
-        references: (K, r, 3) rad, joint positions at the ends of the time steps.
-        effort: (r, 3) N m, largest torques.
-        step: Time step, s.
-    """
+    """Ideal drives with limited torques; the arguments are explained in :func:`ideal_step`."""
 
     def __init__(self, references: FloatArray, effort: FloatArray, step: float) -> None:
         """Store the arguments; no motor has been at its limit yet."""
-        self._references, self._effort, self._step = references, effort, step
+        self._references, self._effort, self.step = references, effort, step
         self._behind = np.zeros((2, len(effort)), dtype=np.bool_)
 
     def move(self, index: int, course: Course, at: Motion, new: tuple[FloatArray, ...]) -> None:
         """Compute a time step; arguments as in :func:`ideal_step`."""
         ideal_step(
-            index, self._references, self._effort, course[:-1], at, self._step, new, self._behind
+            index, self._references, self._effort, course[:-1], at, self.step, new, self._behind
         )
 
     def push(
@@ -63,7 +57,7 @@ class IdealSteps:
     ) -> FloatArray:
         """Find the torques (r, 3) N m of a time step; arguments as in :func:`ideal_push`."""
         torque = np.empty_like(theta)
-        references, effort, step = self._references, self._effort, self._step
+        references, effort, step = self._references, self._effort, self.step
         ideal_push(index, references, effort, theta, rates, inverse, step, torque, self._behind)
         return torque
 
@@ -106,7 +100,6 @@ def march(
     steps: IdealSteps | ServoSteps,
     count: int,
     course: Course,
-    step: float,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
     """Compute ``count`` time steps of r robots by forward dynamics.
@@ -119,8 +112,7 @@ def march(
         steps: Drives of the robots.
         count: Number of time steps, K.
         course: State of the robots at the beginning.
-        step: Time step, s.
-        touch: Function that moves objects and cups, and returns forces on P.
+        touch: Function that moves objects and cups.
 
     Returns:
         State of the robots at the end, and the torques (K, r, 3) N m in all time steps.

@@ -81,14 +81,10 @@ def pass_through(
     steps: IdealSteps,
     count: int,
     course: Course,
-    step: float,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
-    """Compute ``count`` time steps of r robots with ideal drives.
-
-    Arguments and results are explained in :func:`.forward_dynamics.march`.
-    """
-    torques = np.empty((count, *course.theta.shape))
+    """Compute time steps of robots with ideal drives, as :func:`.forward_dynamics.march` does."""
+    torques, step = np.empty((count, *course.theta.shape)), steps.step
     speed = (course.position - course.before) / step
     for index in range(count):
         # K in the middle of the time step gives accurate changes of the joint positions.

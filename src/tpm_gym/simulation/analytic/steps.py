@@ -17,6 +17,7 @@ from tpm_gym.simulation.compiled import servo_torque
 from tpm_gym.simulation.drives import References
 from tpm_gym.simulation.vectors import (
     Symmetric,
+    clip,
     dot,
     onto,
     page_row,
@@ -236,16 +237,11 @@ def modes_left(
 
 @compiled
 def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
-    """Compute the joint velocities u after an impulse, with Coulomb friction.
+    """Compute the joint velocities u after an impulse (N m s), with Coulomb friction.
 
-    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, the
-    size of the resistance is at most limit. So u minimises
+    mass @ u = impulse - resistance, with mass in kg m^2. The resistance of a joint is
+    limit * sign(u); if u is 0, its size is at most limit (N m s, zero or more). So u minimises
     u @ mass @ u / 2 - impulse @ u + limit @ |u|.
-
-    Args:
-        mass: Inertia, kg m^2.
-        impulse: N m s.
-        limit: N m s, zero or more.
     """
     found = solved(mass, impulse)
     if limit[0] != 0 or limit[1] != 0 or limit[2] != 0:
@@ -293,11 +289,7 @@ def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
             (1.0 - abs(u), 1.0 - abs(v), 1.0 - abs(w)),
         )
         p, q, r = plus((x, y, z), fixed)
-        tried = (
-            min(max(p, -most[0]), most[0]),
-            min(max(q, -most[1]), most[1]),
-            min(max(r, -most[2]), most[2]),
-        )
+        tried = clip(p, -most[0], most[0]), clip(q, -most[1], most[1]), clip(r, -most[2], most[2])
         a, b, c = spread(matrix, tried)
         cost = dot(tried, plus((a / 2, b / 2, c / 2), wanted, -1.0))
         if cost < best:

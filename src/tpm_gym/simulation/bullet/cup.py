@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import pybullet
 
@@ -12,40 +11,22 @@ from tpm_gym.arrays import Vector
 from tpm_gym.mechanism.cup import CUP, sealed
 from tpm_gym.simulation.bullet.client import Client
 from tpm_gym.simulation.bullet.robot import Robot
-from tpm_gym.simulation.engine import Pose
+from tpm_gym.simulation.engine import Grip, Pose
 from tpm_gym.simulation.state import Block
-from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
+from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Load, hold_after
 
 _WELD_FORCE = 1e4  # N; so large that only the vacuum law ends the weld
 _FASTEST = 2.5  # m/s, largest speed of lip towards object: twice the largest commanded speed
-
-
-class Grip(NamedTuple):
-    """Held object, vacuum, and the held object's pose.
-
-    The pose is given in the frame at the centre of mass of the link with the cup. It is None if no
-    object is held.
-    """
-
-    hold: Hold = EMPTY
-    pose: Pose | None = None
 
 
 class Cup:
     """Vacuum cup on a robot's platform; it can hold one object.
 
     The weld keeps a gap of 20 um between lip and object. Without a gap, their contact would act
-    against the weld.
-
-    Args:
-        client: Physics client.
-        robot: Robot with the cup.
-        bodies: Body ids of the objects.
-        blocks: Objects of the scene.
-        time_step: Time step, s.
+    against the weld. ``bodies`` are the body ids of the objects ``blocks``; ``time_step`` is in s.
 
     Attributes:
-        grip: Held object and its weld.
+        grip: Held object, and its pose in the frame at the centre of mass of the cup's link.
         first: First time step of the control period in which the lip can touch an object.
         first_update: First time step of the control period that needs :meth:`update`.
     """

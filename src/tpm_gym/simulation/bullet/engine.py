@@ -12,14 +12,23 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.bullet.client import Client
-from tpm_gym.simulation.bullet.cup import Cup, Grip
+from tpm_gym.simulation.bullet.cup import Cup
 from tpm_gym.simulation.bullet.friction import Friction
 from tpm_gym.simulation.bullet.physics import Physics
 from tpm_gym.simulation.bullet.robot import Robot
 from tpm_gym.simulation.bullet.scenery import Scenery
 from tpm_gym.simulation.bullet.window import Window
 from tpm_gym.simulation.drives import Servo, ServoDrives
-from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, Twist, drives_of_one, steering
+from tpm_gym.simulation.engine import (
+    Engine,
+    Grip,
+    Path,
+    Pose,
+    Readout,
+    Twist,
+    drives_of_one,
+    steering,
+)
 from tpm_gym.simulation.imaging import Camera, Picture, View
 from tpm_gym.simulation.randomisation import NOMINAL, Plant
 from tpm_gym.simulation.settings import settings_of

@@ -23,15 +23,7 @@ from tpm_gym.simulation.imaging import (
     View,
     metres,
 )
-from tpm_gym.simulation.stage import (
-    FLOOR,
-    FLOOR_EDGE,
-    LIGHT,
-    PATCH_HEIGHT,
-    Slab,
-    boards,
-    painted,
-)
+from tpm_gym.simulation.stage import FLOOR, FLOOR_EDGE, LIGHT, PATCH_HEIGHT, Slab, boards, painted
 from tpm_gym.simulation.state import Block, Scene
 
 _SHADING = {"lightAmbientCoeff": 0.6, "lightDiffuseCoeff": 0.35, "lightSpecularCoeff": 0.05}
@@ -40,10 +32,7 @@ _SHADING = {"lightAmbientCoeff": 0.6, "lightDiffuseCoeff": 0.35, "lightSpecularC
 class Scenery:
     """Bodies in the client that do not belong to the robot.
 
-    Args:
-        client: Physics client.
-        scene: Objects to load.
-        table: Half edge lengths of the tables along x and y, m.
+    The argument ``table`` has the half edge lengths of the tables along x and y, m.
 
     Attributes:
         bodies: Body ids of the objects, in the order of the scene.
@@ -73,13 +62,9 @@ class Scenery:
                     client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
     def _add_slab(self, slab: Slab, low: float, high: float, width: float) -> int:
-        """Add a static board, and return its body id.
+        """Add a static board from ``low`` to ``high`` (m) along x, and return its body id.
 
-        Args:
-            slab: Thickness, height, colour and friction of the board.
-            low: Lower end along x, m.
-            high: Upper end along x, m.
-            width: Half the width along y, m.
+        ``width`` is half the width along y, m.
         """
         half, height = ((high - low) / 2, width, slab.half_height), slab.top - slab.half_height
         body = self._add_box(half, ((low + high) / 2, 0.0, height), slab.colour)

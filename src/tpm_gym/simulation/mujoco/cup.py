@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
 from tpm_gym.arrays import Quaternion, Vector, rotate
 from tpm_gym.mechanism.cup import CUP, sealed
-from tpm_gym.simulation.engine import Pose
+from tpm_gym.simulation.engine import Grip, Pose
 from tpm_gym.simulation.mujoco.model import grip_name, object_name
 from tpm_gym.simulation.mujoco.robot import Robot
 from tpm_gym.simulation.mujoco.scenery import Scenery
 from tpm_gym.simulation.state import Block
-from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Hold, Load, hold_after
+from tpm_gym.simulation.vacuum import CLEARANCE, EMPTY, Load, hold_after
 
 _SOFTER = 0.5
 """Factor of the stiffness of a held object's contacts, for example with the table.
@@ -25,13 +24,6 @@ cup's spring and the torques of the motors would be 3% smaller than in PyBullet.
 """
 
 
-class Grip(NamedTuple):
-    """Held object and vacuum, and the pose of the held object (if any) in the tool's frame."""
-
-    hold: Hold = EMPTY
-    pose: Pose = Pose((0.0, 0.0, 0.0))
-
-
 class Cup:
     """Vacuum cup on a robot's platform; it can hold one object.
 
@@ -39,7 +31,7 @@ class Cup:
     pressure and shear, so its force is the load of the seal.
 
     Attributes:
-        grip: Held object and its pose.
+        grip: Held object, and its pose in the tool's frame.
     """
 
     def __init__(
@@ -83,7 +75,7 @@ class Cup:
         if hold.which == before.which:
             self.grip = Grip(hold, pose)
             return False
-        self.set(Grip(hold, self._sealed_pose(hold.which) if hold.which >= 0 else pose))
+        self.set(Grip(hold, self._sealed_pose(hold.which) if hold.which >= 0 else None))
         return True
 
     def set(self, grip: Grip) -> None:
@@ -92,8 +84,8 @@ class Cup:
         active[self._welds] = 0
         model.pair_solref[:, 0] = self._stiffness
         self.grip = grip
-        which, ((x, y, z), (qx, qy, qz, qw)) = grip.hold.which, grip.pose
-        if which >= 0:
+        if grip.pose is not None:
+            which, ((x, y, z), (qx, qy, qz, qw)) = grip.hold.which, grip.pose
             weld = self._welds[which]
             active[weld] = 1
             model.pair_solref[self._pairs[which], 0] *= _SOFTER

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tpm_gym.arrays import BoolArray, FloatArray, IntArray, Vector
 from tpm_gym.mechanism.machine import Machine
 from tpm_gym.simulation.drives import Servo, ServoDrives
-from tpm_gym.simulation.engine import Engine, Path, Pose, Readout, drives_of_one, steering
+from tpm_gym.simulation.engine import Engine, Grip, Path, Pose, Readout, drives_of_one, steering
 from tpm_gym.simulation.imaging import Camera, Picture, View
-from tpm_gym.simulation.mujoco.cup import Cup, Grip
+from tpm_gym.simulation.mujoco.cup import Cup
 from tpm_gym.simulation.mujoco.model import compile_model, segmentation_ids
 from tpm_gym.simulation.mujoco.physics import Physics
 from tpm_gym.simulation.mujoco.pictures import Pictures

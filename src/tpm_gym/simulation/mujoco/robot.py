@@ -30,8 +30,6 @@ class Robot:
     """Robot in a MuJoCo model.
 
     Args:
-        model: Compiled model.
-        data: State of the model.
         machine: Machine with the true lengths of the robot.
         ideal: Whether the motors have ideal drives; else they apply given torques.
 

@@ -132,7 +132,6 @@ class Kind:
                 and no rotated posture exists at ``position``.
             UnreachableError: If ``operation`` is "translating" and ``position`` is out of reach.
         """
-        del operation, working, tilt
         theta = self.machine.require_inverse(np.array(vector("position", position)))
         return self.at_joints(theta, None)
 
@@ -173,7 +172,6 @@ class Kind:
         - conditioning: a mesh, and the conditionings at its vertices;
         - margin: a :class:`Margin`, or None.
         """
-        del posture
         return {}
 
 

@@ -61,10 +61,8 @@ def advance(
         tables: State of the objects and cups of all robots; changed.
         earlier: Output: the state of the simulated robots at the beginning of the control period.
         rows: (r,) indices of the robots to simulate.
-        path: Motion of point P of these robots, in all time steps of the control period.
+        path: Motion of point P of these robots.
         on: (r,) whether the vacuum is on.
-        setting: Constants of the simulation.
-        work: Workspace of the solver.
         push: (r, w, 3) N, force on the platform in each of the final w time steps of ``path``,
             machine's frame; output, initially zero.
         carried: (r,) kg, masses of the held objects at the end; output, initially zero.
@@ -120,10 +118,7 @@ def read(
 def place(tables: Tables, rows: IntArray, poses: FloatArray, setting: Setting) -> None:
     """Release held objects, and place all objects with zero velocity.
 
-    The details are explained in :meth:`.contact.Contact.place`.
-
-    Args:
-        poses: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects, world.
+    Details and arguments are explained in :meth:`.contact.Contact.place`.
     """
     for i in range(len(rows)):
         row, standing = rows[i], tables.belts[rows[i]] == 0
