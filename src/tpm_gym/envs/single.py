@@ -111,8 +111,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Reward
 
-    ``goal`` term + ``singularity`` term (+ ``gate`` in Cycle, in sparse rewards too; + in dense
-    rewards ``approach`` where there are objects).
+    The sum of the terms ``goal`` and ``singularity``. Cycle adds ``gate``, to sparse and dense
+    rewards. Tasks with objects add ``approach``, to dense rewards only.
 
     | term | value |
     | --- | --- |
