@@ -339,7 +339,11 @@ class Core:
 
     @property
     def state(self) -> State:
-        """The state after the last step or reset; raise EpisodeError if no episode is running."""
+        """The state after the last step or reset.
+
+        Raises:
+            EpisodeError: If no episode is running.
+        """
         if self._state is None:
             self.require_open()
             raise EpisodeError("no episode is running; call reset() first")

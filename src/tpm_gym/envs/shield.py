@@ -337,7 +337,10 @@ def solved(
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.
         lack: (r,) conditioning that is lacking at ``point``.
-        wanted, last, low, high: See :class:`Problem`.
+        wanted: (r, 3) wanted commands, in units of the action.
+        last: (r, 3) last commands, in units of the action.
+        low: (r, 3) m, lower corner of the commands that the control can give.
+        high: (r, 3) m, upper corner.
 
     Returns:
         Points (r, 3) m, and how far (r,) they are from ``point`` in units of the action.

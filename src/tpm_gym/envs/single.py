@@ -112,7 +112,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     ## Reward
 
     The sum of the terms ``goal`` and ``singularity``. Cycle adds ``gate``, to sparse and dense
-    rewards. Tasks with objects add ``approach``, to dense rewards only.
+    rewards. Tasks with objects add ``approach``, to dense rewards only. In the step that passes a
+    singularity, the term ``singularity`` is -penalty_weight.
 
     | term | value |
     | --- | --- |

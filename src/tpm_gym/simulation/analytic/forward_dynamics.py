@@ -118,7 +118,7 @@ def march(
         steps: Drives of the robots.
         count: Number of time steps, K.
         course: State of the robots at the beginning.
-        touch: Function that moves objects and cups, and returns forces on P.
+        touch: Function that moves objects and cups, and returns forces on P and carried masses.
 
     Returns:
         State of the robots at the end, and the torques (K, r, 3) N m in all time steps.
