@@ -1,6 +1,6 @@
 """A page for each registered task, from its class, its spaces, its expert and the records.
 
-docs/task-sheets.md has what a reader needs without a build; ``make docs`` writes it too.
+``make docs`` also writes docs/task-sheets.md, for readers who do not build these pages.
 
 ``tpm_task_modules`` in conf.py names further modules to import, which register tasks of their own.
 """
@@ -248,7 +248,7 @@ def _terms_of_reward(tasks: dict[str, Task]) -> Iterator[str]:
 
 
 def _success(task: Task) -> str:
-    """Return a sentence on success, with the words of the task for a distance of its own."""
+    """Return the condition of success; if the task overrides gap, in the words of its gap."""
     own = type(task).gap is not Task.gap
     distance = _result(type(task).gap) if own else "the distance to the goal"
     return f'Success, `info["is_success"]`: {distance} is below {1e3 * task.tolerance:g} mm.'
@@ -263,7 +263,7 @@ def _events(task: Task) -> Iterator[str]:
 
 
 def _result(function: Any) -> str:
-    """Return what a function returns, in the words of its docstring."""
+    """Return a function's docstring without "Return" and without the shape of the result."""
     text = " ".join(line for line in _sentences(function) if line)
     return re.sub(r", \((n|\.\.\.),\)( m)?", "", text).removeprefix("Return ").removesuffix(".")
 

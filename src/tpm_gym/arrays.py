@@ -125,8 +125,8 @@ def explained(
 ) -> _Explained:
     """Return the error of the first of ``points`` (..., 3) for which ``chosen`` (...,) is true.
 
-    ``explain`` returns the error of a point. If there are several points, an UnreachableError gets
-    the index of this point.
+    ``explain`` makes the error from the point. If it is an UnreachableError, its attribute
+    ``index`` is set to the index of this point in the array.
     """
     x, y, z = points[chosen][0].tolist()
     error = explain((x, y, z))

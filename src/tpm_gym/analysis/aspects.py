@@ -155,11 +155,14 @@ def regions(
     """Find the connected regions of cells with equal codes, and yield the largest region first.
 
     Args:
-        low: Corner of the grid; see :class:`Cells`.
+        low: Corner of the grid with the smallest x, y, z, m.
         spacing: Edges of a cell, m.
         codes: (nx, ny, nz) code of each cell, such as the signs of its factors as bits; negative
             for cells that belong to no region.
         min_cells: Fewest cells of a region.
+
+    Yields:
+        The code and the cells of a region.
 
     Raises:
         ConfigurationError: min_cells is no positive whole number.

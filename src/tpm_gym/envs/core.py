@@ -188,10 +188,18 @@ class Core:
         Args:
             rows: (r,) environments.
             rngs: Their generators from now on.
-            options: As in :meth:`tpm_gym.TPMEnv.reset`, whose errors are raised.
+            options: As in :meth:`tpm_gym.TPMEnv.reset`.
 
         Returns:
             The randomisation of each episode; empty dictionaries without randomisation.
+
+        Raises:
+            EpisodeError: If the environments are closed.
+            ResetOptionError: If an option is not possible; the environments are then unchanged.
+            UnreachableError: If an object or the goal is out of reach; the environments are then
+                unchanged.
+            ConfigurationError: If the task returns a wrong start, or a goal outside the observation
+                space.
         """
         self.require_open()
         before = [rng.bit_generator.state for rng in rngs] if options is not None else []
@@ -301,7 +309,12 @@ class Core:
     # -- pictures ---------------------------------------------------------------------------
 
     def frame(self, row: int) -> Any:
-        """Draw an environment in its ``render_mode``; see :meth:`tpm_gym.TPMEnv.render`."""
+        """Draw an environment in its ``render_mode``.
+
+        Raises:
+            EpisodeError: If the environments are closed, or before the first reset.
+            ConfigurationError: If the engine cannot draw in this ``render_mode``.
+        """
         return self._rendering.frame(self.simulation, row, self._markers(row))
 
     def show(self) -> None:
@@ -329,14 +342,25 @@ class Core:
 
     @property
     def state(self) -> State:
-        """The state after the last step or reset; raise EpisodeError if no episode is running."""
+        """The state after the last step or reset.
+
+        Raises:
+            EpisodeError: If no episode is running.
+        """
         if self._state is None:
             self.require_open()
             raise EpisodeError("no episode is running; call reset() first")
         return self._state
 
     def save(self, **columns: NDArray[Any]) -> EnvSnapshot:
-        """Return a snapshot; ``columns`` are further arrays to keep in it, by name."""
+        """Return a snapshot of everything that the next steps depend on.
+
+        Args:
+            columns: Further arrays to keep in the snapshot, by name.
+
+        Raises:
+            EpisodeError: If no episode is running.
+        """
         _ = self.state  # raises without an episode
         rngs = [{**rng.bit_generator.state, "seed": seed_of(rng)} for rng in self.rngs]
         own = {"goals": self.goals, "pending": self._pending, "views": self._views, **columns}
@@ -351,7 +375,13 @@ class Core:
         return snapshot
 
     def restore(self, snapshot: Any) -> Observation:
-        """Continue from a snapshot, as :meth:`tpm_gym.TPMEnv.restore_state`."""
+        """Continue from a snapshot of these or equal environments; return the observation.
+
+        Raises:
+            EpisodeError: If the environments are closed.
+            InputError: If ``snapshot`` is no snapshot of equal environments; the environments are
+                then unchanged.
+        """
         self.require_open()
         self.require_equal(snapshot)
         self.rngs = [np.random.default_rng(state.get("seed")) for state in snapshot.rngs]
@@ -456,7 +486,7 @@ def _accelerations(task: Task) -> tuple[Vector, Vector] | None:
 
 
 def _require_in_space(goals: FloatArray) -> None:
-    """Refuse goals (r, goal_size) m out of the observation space, which P cannot achieve."""
+    """Refuse goals (r, goal_size) m that are outside the observation space."""
     beyond = np.abs(goals).max(axis=1) > GOAL_BOUND
     if beyond.any():
         valid = f"coordinates from -{GOAL_BOUND:g} to {GOAL_BOUND:g} m, as the observation space"
@@ -489,7 +519,11 @@ def _not_finite(
 
 
 def compute_reward(task: Task, achieved: ArrayLike, desired: ArrayLike, info: Any) -> Any:
-    """Compute rewards of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`."""
+    """Compute rewards of transitions for any goals; see :meth:`tpm_gym.TPMEnv.compute_reward`.
+
+    Raises:
+        InputError: If the goals are no real numbers of fitting shapes, or ``info`` does not fit.
+    """
     _require_goals(task.goal_size, achieved, desired)
     goal_term = np.asarray(task.goal_term(task.gap(achieved, desired)))
     try:

@@ -41,7 +41,12 @@ class Rendering:
         self.view = View(camera, int(width), int(height), segmented)
 
     def frame(self, simulation: Simulation, row: int, markers: ArrayLike) -> Any:
-        """Draw one environment in the render mode, with goal markers at points (k, 3) m, world.
+        """Draw one environment in the render mode.
+
+        Args:
+            simulation: Simulation of all environments.
+            row: Index of the environment.
+            markers: Points (k, 3) m, world frame, at which the k goal markers are drawn.
 
         Raises:
             ConfigurationError: If the engine cannot draw in the render mode.
@@ -87,9 +92,13 @@ class Pixels:
         simulation: Simulation,
         rows: Iterable[tuple[int, ArrayLike]],
     ) -> dict[str, Any]:
-        """Return observations (n, ...) with a picture of each environment.
+        """Return observations with a picture of each environment.
 
-        ``rows`` has the row and the goal markers of each environment.
+        Args:
+            observation: Observations without pictures, (n, ...) each.
+            simulation: Simulation to draw.
+            rows: For each environment, its row, and the points (k, 3) m, world frame, of its k goal
+                markers.
         """
         frames = [self._rendering.frame(simulation, row, markers) for row, markers in rows]
         kept = np.ascontiguousarray(observation["observation"][:, self._columns])

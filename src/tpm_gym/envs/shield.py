@@ -7,8 +7,11 @@ conditioning 1/cond(J) stays at ``least`` or above on this curve and this line. 
 to hold the last command c: P then moves on the line from b to c, and the check of c included this
 line.
 
-Sequential quadratic programming finds the nearest safe command; docs/shield.md says why it can.
-:class:`BrakingShield` is for tasks in which a robot cannot hold the last command at once.
+Sequential quadratic programming finds the nearest safe command, as docs/shield.md explains. If all
+searches fail, the command is moved towards the last command.
+
+If a task bounds the accelerations of commands, a robot cannot hold the last command at once. For
+such tasks, :class:`BrakingShield` allows only commands after which the robot can brake in time.
 
 Importing this module imports Numba.
 """
@@ -334,7 +337,10 @@ def solved(
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.
         lack: (r,) conditioning that is lacking at ``point``.
-        wanted, last, low, high: See :class:`Problem`.
+        wanted: (r, 3) wanted commands, in units of the action.
+        last: (r, 3) last commands, in units of the action.
+        low: (r, 3) m, lower corner of the commands that the control can give.
+        high: (r, 3) m, upper corner.
 
     Returns:
         Points (r, 3) m, and how far (r,) they are from ``point`` in units of the action.

@@ -111,9 +111,10 @@ class TPMEnv(gym.Env[Observation, Action]):
 
     ## Reward
 
-    ``goal`` term + ``singularity`` term (+ ``gate`` in Cycle, in sparse rewards too; + in dense
-    rewards ``approach`` where there are objects). In Stack, the distance is that of the block
-    farther from its goal, and the cup approaches the upper block.
+    The sum of the terms ``goal`` and ``singularity``. Cycle adds ``gate``, to sparse and dense
+    rewards. Tasks with objects add ``approach``, to dense rewards only. In Stack, the distance is
+    that of the block farther from its goal, and the cup approaches the upper block. In the step
+    that passes a singularity, the term ``singularity`` is -penalty_weight.
 
     | term | value |
     | --- | --- |

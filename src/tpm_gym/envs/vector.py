@@ -43,17 +43,18 @@ Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
     """n environments that are stepped together.
 
-    Spaces, rewards, seeds, infos and further arguments are as in :class:`~tpm_gym.TPMEnv`. In the
-    analytic engine, the results of an environment do not depend, in any bit, on the number of
-    environments and threads. Infos have the form of Gymnasium's vector environments, with a mask
-    ``_key`` for each ``key``.
+    Spaces, rewards, seeds and infos are as in :class:`~tpm_gym.TPMEnv`, which also explains the
+    arguments that are not listed here. In the analytic engine, the results of an environment do not
+    depend, in any bit, on the number of environments and threads. Infos have the form of
+    Gymnasium's vector environments, with a mask ``_key`` for each ``key``.
 
     Args:
         num_envs: Number of environments, n.
         engine: ``"analytic"`` computes all environments together. With other engines, each
             environment has its own engine, and the environments are stepped one after another.
         num_threads: Largest number of threads that step the environments of the analytic engine.
-            Each thread steps at least 1,024 environments: with fewer, one thread is faster.
+            Several threads are used only if each of them steps at least 1,024 environments, because
+            one thread is faster with fewer.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         autoreset_mode: Time of the reset after the end of an episode: ``NEXT_STEP``, ``SAME_STEP``
             (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (the user calls
@@ -451,7 +452,11 @@ class _Part:
 
         In ``observation`` and in the returned infos, the first values of the new episodes replace
         the last values of the ended episodes. The last values are in ``final_obs`` and
-        ``final_info`` of the returned infos. ``last`` are the infos after the last step.
+        ``final_info`` of the returned infos.
+
+        Args:
+            observation: Observations after the last step; changed.
+            last: Infos after the last step.
         """
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()
         final = np.full(core.count, None, dtype=object)
@@ -488,8 +493,11 @@ class _Part:
 def _sizes(count: int, most: int | None, threads: int) -> list[int]:
     """Divide ``count`` environments into parts, and return the sizes of the parts.
 
-    ``most`` is the largest size of a part. If it is None, each of the ``threads`` has a part, but
-    there are so few parts that each has enough environments for a thread.
+    Args:
+        count: Number of environments.
+        most: Largest size of a part. If it is None, there is one part for each thread.
+        threads: Largest number of threads. Several threads are used only if each of them gets at
+            least ``_FEWEST`` environments.
     """
     parts = min(threads, max(count // _FEWEST, 1)) if most is None else -(-count // most)
     return [count // parts + (k < count % parts) for k in range(parts)]
@@ -504,9 +512,9 @@ def _mode_of(value: AutoresetMode | str) -> AutoresetMode:
 
 
 def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[str, Any]:
-    """Return ``info`` with a mask ``_key`` (count,) for each ``key``; it is true in ``rows``.
+    """Return ``info`` with a mask ``_key`` (count,) for each ``key``.
 
-    If ``rows`` is None, it is true everywhere.
+    The mask is true in ``rows``, or everywhere if ``rows`` is None.
     """
     mask = np.ones(count, dtype=np.bool_)
     if rows is not None:
@@ -521,7 +529,11 @@ def _masked(info: Mapping[str, Any], rows: IntArray | None, count: int) -> dict[
 
 
 def _updated(last: Mapping[str, Any], first: Mapping[str, Any], rows: IntArray) -> dict[str, Any]:
-    """Return a copy of the infos ``last`` of a step, with the infos ``first`` of new episodes."""
+    """Return a copy of the infos ``last``, in which ``first`` replaces the values of ``rows``.
+
+    ``last`` are the infos of a step, and ``first`` the infos of new episodes in the environments
+    ``rows``.
+    """
     result: dict[str, Any] = {}
     for name, value in last.items():
         if isinstance(value, Mapping):

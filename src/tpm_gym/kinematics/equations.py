@@ -372,7 +372,11 @@ def no_posture(point: Vector, branch: WorkingMode, g: Geometry) -> UnreachableEr
 def leg_margin(level: float, vertical: float, out: float, g: LegLengths) -> Numbers:
     """Return the margin by which a leg reaches C, m; negative if the leg does not reach C.
 
-    ``level``, ``vertical`` and ``out`` are the arguments a, b and out of :func:`arm`, m.
+    Args:
+        level: Horizontal distance of C from A in the arm's plane, m.
+        vertical: Vertical distance of C from A, m.
+        out: Distance of C from the arm's plane, m.
+        g: Lengths of the leg.
     """
     if abs(out) >= g.l4:
         return g.l4 - abs(out)

@@ -58,7 +58,7 @@ class Geometry:
             if not is_number(value) or value < 0 or (value == 0 and name != "l6"):
                 least = "not negative" if name == "l6" else "positive"
                 raise GeometryError(name, value, f"it must be a finite number, {least}")
-            object.__setattr__(self, name, float(value))  # no key is added
+            object.__setattr__(self, name, float(value))  # allowed in this loop: no new key
         l1, l5 = self.l1, self.l5
         close = _CLOSE * l1
         if self.l3 > l1 - close and min(l5, abs(l5 - l1)) < close:

@@ -58,9 +58,9 @@ def forward(
 ) -> FloatArray:
     """Compute the position of P (..., 3) m at theta (..., 3) rad, in the assembly mode ``branch``.
 
-    The default gives y > 0; ``AssemblyMode(-1, -1)`` gives the mirror image at y < 0. So
-    ``forward(inverse(point))`` is the point only if its assembly mode is the default. The mode of
-    any point is ``ASSEMBLY_MODES[assembly_of(point)]``, by :func:`.workspace.assembly_of`.
+    The default mode gives y > 0. ``AssemblyMode(-1, -1)`` gives the mirror image at y < 0. So
+    ``forward(inverse(point))`` is the point only if the point is in the default mode. The mode of
+    any point is ``ASSEMBLY_MODES[assembly_of(point)]``; see :func:`.workspace.assembly_of`.
     """
     return assembled(theta, branch, geometry).position[..., branch.index, :]
 
@@ -68,7 +68,10 @@ def forward(
 def inverse(
     position: ArrayLike, branch: WorkingMode = ELBOWS_OUT, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute angles (..., 3) rad, in the ranges of :class:`.InverseSolutions`, in one mode."""
+    """Compute angles (..., 3) rad for P at position (..., 3) m, in the working mode ``branch``.
+
+    :class:`.InverseSolutions` states the ranges of the angles.
+    """
     require_mode(branch, WorkingMode)
     places = finite_points("position", position)
     solutions = inverse_all(places, geometry)

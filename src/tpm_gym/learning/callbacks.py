@@ -107,7 +107,7 @@ def quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class Progress(BaseCallback):
-    """Progress of a training; ``advance`` is called with the number of new steps."""
+    """Callback that calls ``advance`` with the number of new steps after each step."""
 
     advance: Callable[[int], object]
 

@@ -361,7 +361,10 @@ def check_least(config: Any, least: int, *names: str) -> None:
 
 
 def check_seed(seed: int, count: int) -> None:
-    """Refuse ``count`` seeds from ``seed`` on, by a ConfigError, if any is negative or held out."""
+    """Raise ConfigError if one of ``count`` seeds, ``seed`` and the next ones, is not allowed.
+
+    Seeds are not allowed if they are negative or held out for evaluations.
+    """
     most = SELECTION_SEED - count
     problem = f"must lie in 0 ... {most}: seeds from {SELECTION_SEED} up are held out"
     _refuse(not 0 <= seed <= most, f"--seed {seed}: {problem}")

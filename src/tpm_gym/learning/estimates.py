@@ -40,7 +40,10 @@ def wilson(outcomes: Sequence[bool]) -> Estimate:
 
 
 def bootstrap(values: Sequence[float], worst: float | None = None) -> Estimate:
-    """Return the mean of values with its 95% percentile bootstrap interval (Efron 1979)."""
+    """Return the mean of values with its 95% percentile bootstrap interval (Efron 1979).
+
+    ``worst`` becomes the attribute ``worst`` of the estimate.
+    """
     sample = np.asarray(values, dtype=np.float64)  # (n,)
     rng = np.random.default_rng(_SEED)
     # In blocks, since the matrix of all resamples of many values does not fit in memory.

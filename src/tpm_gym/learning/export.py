@@ -112,8 +112,9 @@ def save(
 ) -> Path:
     """Write the policy of a model; return the path of the JSON file.
 
-    The files ``path``.safetensors and ``path``.json get these names only after a check that the
-    written policy acts like the model. A policy that they cannot express is refused, not changed.
+    The files are ``path``.safetensors and ``path``.json. They get these names only after a check
+    that the written policy acts like the model. A policy that the files cannot express is refused,
+    not changed.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.

@@ -37,7 +37,9 @@ def style() -> AbstractContextManager[None]:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, without Matplotlib's version: an update would change the bytes.
+    """Write a figure as PNG, with metadata that do not contain Matplotlib's version.
+
+    With the version, the bytes of the file would change at every update of Matplotlib.
 
     Drawing takes a second. It happens in memory, so that a process that is killed meanwhile leaves
     no part of a file.

@@ -22,9 +22,14 @@ _ROWS = {
 
 
 def write(policy: Path, evaluation: Path) -> Path:
-    """Write the model card of an exported policy, given by its JSON file; return the card's path.
+    """Write the model card of a policy beside its files; return the path of the card.
 
-    ``evaluation`` and errors are those of :func:`check`.
+    Args:
+        policy: JSON file of an exported policy.
+        evaluation: JSON file of ``tpm-gym evaluate --json`` with one policy.
+
+    Raises:
+        ConfigError: As :func:`check`.
     """
     content = provenance.read_json(policy)
     card = policy.with_suffix(".md")

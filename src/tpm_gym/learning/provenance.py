@@ -103,7 +103,10 @@ def _portable(word: str) -> str:
 
 
 def require_packages(extras: Mapping[str, str]) -> None:
-    """Raise MissingPackageError if a package is missing; ``extras`` names the extra of each."""
+    """Raise MissingPackageError if a package is missing.
+
+    ``extras`` names, for each required package, the extra of tpm_gym that installs it.
+    """
     for package, extra in extras.items():
         if find_spec(package) is None:
             raise MissingPackageError(package, extra)

@@ -74,7 +74,13 @@ class Recipe:
 
 
 def _falling(start: float, update: float, remaining: float) -> float:
-    """Return the learning rate when a fraction ``remaining`` of all steps is left to take."""
+    """Return the learning rate of an update.
+
+    Args:
+        start: Learning rate at the start of the training.
+        update: Steps between two updates, as a fraction of all steps.
+        remaining: Steps after this update, as a fraction of all steps.
+    """
     return start * max(0.0, min(1.0, remaining + update))
 
 

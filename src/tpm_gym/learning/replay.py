@@ -1,7 +1,8 @@
 """Episodes of a policy at several moments of its training, for datasets of kind ``replay``.
 
-The policy acts with its exploration. The episodes have seeds of their own and do not affect the
-training. The moments are spread evenly over the steps after the demonstrations, if there are any.
+The policy acts as in training, with its exploration. The moments are spread evenly over the
+training; if the training begins with demonstrations, over the steps after them. The episodes have
+seeds of their own and do not affect the training.
 """
 
 from collections.abc import Callable, Iterator

@@ -169,9 +169,13 @@ def resume(config: ResumeConfig, console: Console | None = None) -> signal.Signa
 
 
 def _with_changes(saved: dict[str, Any], newest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the configuration ``saved`` in a checkpoint, with changeable options of ``newest``.
+    """Return the configuration ``saved``, with the options of ``newest`` that resuming can change.
 
-    ``newest``, in the run folder, differs if a resumption was killed before its first checkpoint.
+    These options differ if an earlier resumption was killed before its first checkpoint.
+
+    Args:
+        saved: Configuration in the checkpoint.
+        newest: Configuration in the folder of the run.
     """
     given = {name: newest.get(name) for name in _CHANGEABLE}
     return saved | {n: value for n, value in given.items() if isinstance(value, _CHANGEABLE[n])}

@@ -53,12 +53,18 @@ def moving_joints(mechanism: Mechanism) -> list[str]:
 def rates(
     mechanism: Mechanism, places: Mapping[str, Place], name: str, offset: Vector
 ) -> tuple[FloatArray, FloatArray]:
-    """Differentiate position and orientation of the link ``name`` by each joint position.
+    """Differentiate position and orientation of a link by each joint position.
+
+    Args:
+        mechanism: Links and joints.
+        places: Positions and orientations of the links.
+        name: Name of the link.
+        offset: Point of the link, in the link's frame, m.
 
     Returns:
-        Velocity of the point ``offset`` (m, link's frame), m/rad (m/m for a slide), and angular
-        velocity of the link, rad/rad, for unit velocities of the joints. Both are (3, number of
-        joints), with columns in the order of :func:`moving_joints`.
+        Velocity of the point, m/rad (m/m for a slide), and angular velocity of the link, rad/rad,
+        for unit velocities of the joints. Both are (3, number of joints), with columns in the order
+        of :func:`moving_joints`.
     """
     joints, point = moving_joints(mechanism), places[name].point(offset)
     linear, angular = np.zeros((3, len(joints))), np.zeros((3, len(joints)))
@@ -144,7 +150,10 @@ def _require_parts(mechanism: Mechanism) -> None:
 
 
 def _require_tree(mechanism: Mechanism, joints: Mapping[str, float]) -> None:
-    """Refuse wrong links, and names that are missing or repeated; see :func:`require_sound`."""
+    """Refuse links that form no tree or have no mass, and names that are missing or repeated.
+
+    :func:`require_sound` lists all conditions.
+    """
     links, names = [link.name for link in mechanism.links], moving_joints(mechanism)
     held = [link.joint for link in mechanism.links[1:]]
     if mechanism.links[0].joint or None in held:

@@ -428,8 +428,8 @@ _MADE: dict[str, tuple[Any, Machine]] = {}  # callables of registered machines, 
 def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> None:
     """Make a machine available as ``machine=name``; a callable is called at the first use.
 
-    A second call with an equal machine changes nothing. A callable, or a machine of a class, that
-    was defined again, as in a notebook, replaces the old one.
+    A second call with an equal machine changes nothing. If a notebook defines a class or a function
+    again, a machine of the new class, or the new function, replaces the old one.
 
     Raises:
         ConfigurationError: If the name is empty or taken by another machine, or if the value is no
@@ -446,7 +446,10 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
 
 
 def _defined_again(old: Any, new: Any) -> bool:
-    """Return whether callables, or the classes of machines, are different but have one name."""
+    """Return whether ``new`` comes from a second definition of the class or callable of ``old``.
+
+    This is so if the two classes or callables differ, but have the same name and module.
+    """
     kinds = [type(value) if isinstance(value, Machine) else value for value in (old, new)]
     first, second = (getattr(kind, "__qualname__", None) for kind in kinds)
     same = first == second is not None and kinds[0].__module__ == kinds[1].__module__

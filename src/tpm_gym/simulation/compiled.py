@@ -43,7 +43,12 @@ def shifted(
 ) -> FloatArray:
     """Return points + parts * step, projected into the box from ``low`` to ``high``.
 
-    ``points`` and ``parts`` are (n, 3), the other arguments (3,).
+    Args:
+        points: (n, 3), n points.
+        parts: (n, 3), for each point the factors of ``step`` along the three axes.
+        step: (3,), displacement along each axis for a factor of 1.
+        low: (3,), lower corner of the box.
+        high: (3,), upper corner of the box.
     """
     moved = np.empty_like(points)
     for row in range(len(points)):
@@ -107,8 +112,9 @@ def in_world(
             that are 0 are replaced with those of ``left``.
         gap: (n,) m, largest gap of each robot. If it is above ``limit`` or NaN, a loop is open.
         limit: Largest allowed gap, m.
-        turn: (3,) factors of :attr:`.Mount.frame`.
-        origin: (3,) m, origin of :attr:`.Mount.frame`.
+        turn: (3,) signs (1 or -1). The components of a vector in the machine's frame times these
+            signs are its components in the world frame.
+        origin: (3,) m, origin of the machine's frame in the world frame.
 
     Returns:
         Four arrays in the world frame: P (n, 3) m, velocity of P (n, 3) m/s, command (n, 3) m, and
@@ -155,10 +161,17 @@ def measured(
 ) -> FloatArray:
     """Return measurements of n robots and their k objects by encoders, camera and vacuum gauge.
 
-    The first arguments are ``fk_position``, ``fk_velocity``, ``command``, ``object_position``,
-    ``object_axis``, ``object_velocity``, ``held`` and ``vacuum`` of :class:`.State`.
+    Positions, velocities and axes are in the world frame.
 
     Args:
+        position: (n, 3) m, point P.
+        velocity: (n, 3) m/s, velocity of P.
+        command: (n, 3) m, commanded P.
+        places: (n, k, 3) m, centres of the objects.
+        axes: (n, k, 3), z axes of the objects.
+        velocities: (n, k, 3) m/s, velocities of the objects' centres.
+        held: (n,) index of the object in the cup; -1 for none.
+        vacuum: (n,) Pa.
         lip: (3,) m, vector from the lip of the cup to P.
         halves: (k,) m, half heights of the objects.
         most: Largest vacuum, Pa.
@@ -208,10 +221,14 @@ def distances(points: FloatArray, others: FloatArray) -> FloatArray:
 
 @kept
 def any_outside(places: FloatArray, low: FloatArray, high: FloatArray) -> BoolArray:
-    """Return for each row of ``places`` (n, k, 3) whether one of its places is outside, (n,).
+    """Return for each row whether one of its places is outside the box for this place, (n,).
 
-    Place i of a row is outside if it is not in the box from ``low[i]`` to ``high[i]``, (k, 3) each,
-    or has a NaN.
+    A place with NaN is outside.
+
+    Args:
+        places: (n, k, 3), k places in each row. Box i is for place i of every row.
+        low: (k, 3), lowest coordinates in the boxes.
+        high: (k, 3), highest coordinates in the boxes.
     """
     found = np.zeros(len(places), np.bool_)
     for row in range(len(places)):
@@ -228,8 +245,11 @@ def singularity_penalty(
 ) -> FloatArray:
     """Compute the penalty (n,) of :meth:`tpm_gym.tasks.Task.penalty`.
 
-    ``safe`` is the smallest conditioning without penalty. ``assembly`` and ``working`` (n,) are
-    whether a parallel and a serial singularity was passed.
+    Args:
+        conditioning: (n,) conditioning of each robot.
+        safe: Smallest conditioning without penalty.
+        assembly: (n,) whether a parallel singularity was passed.
+        working: (n,) whether a serial singularity was passed.
     """
     penalty = np.empty(len(conditioning))
     for row in range(len(conditioning)):
@@ -471,7 +491,12 @@ def differences(theta: FloatArray, step: float) -> tuple[FloatArray, FloatArray,
 
 @kept
 def beyond(torques: FloatArray, effort: FloatArray) -> BoolArray:
-    """Return (r,) whether a torque (r, k, 3) in k time steps exceeds ``effort`` (r, 3), in N m."""
+    """Return for each robot whether any of its torques exceeds the motor's largest torque, (r,).
+
+    Args:
+        torques: (r, k, 3) N m, torques in k time steps.
+        effort: (r, 3) N m, largest torques of the motors.
+    """
     found = np.zeros(len(torques), np.bool_)
     for row in range(len(torques)):
         for k in range(torques.shape[1]):

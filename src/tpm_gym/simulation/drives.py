@@ -127,7 +127,7 @@ class References(NamedTuple):
 
 
 class ServoDrives:
-    """Servo drives of n robots, built for a nominal machine and a fixed time step (s).
+    """Servo drives of n robots, in an engine with a fixed time step.
 
     A real amplifier updates the torque about 10,000 times per second. An engine updates it only a
     few hundred times per second. With the engine's rate and the stiffness of a real axis, a servo
@@ -137,6 +137,12 @@ class ServoDrives:
     last time step minus M times the acceleration in the last time step. The static stiffness equals
     ``stiffness`` under any load. The damping is larger than ``damping`` by ``stiffness`` x
     ``time_step``.
+
+    Args:
+        servo: Parameters of the servo law.
+        machine: Nominal machine.
+        count: Number of robots, n.
+        time_step: Time step of the engine, s.
 
     Attributes:
         memory: (2, n, 3), torques (N m) in the last time step, and joint velocities (rad/s) at its
@@ -231,8 +237,11 @@ class ServoDrives:
     ) -> FloatArray:
         """Compute the torques (n, 3) N m that the motors apply in a time step.
 
-        ``index`` is the index of the time step in the control period. ``theta`` (n, 3) rad and
-        ``theta_dot`` (n, 3) rad/s are joint positions and velocities at its beginning.
+        Args:
+            references: References of the control period.
+            index: Index of the time step in the control period.
+            theta: (n, 3) rad, joint positions at the beginning of the time step.
+            theta_dot: (n, 3) rad/s, joint velocities at the beginning of the time step.
         """
         step, memory = self._step, self.memory
         self._loops.servo_torques(index, references, self.law, theta, theta_dot, step, memory)

@@ -68,7 +68,10 @@ class Twist(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """Held object and vacuum, and the held object's pose relative to the cup; None without one."""
+    """Held object and vacuum, and the pose of the held object; None if no object is held.
+
+    Each engine chooses the frame of the pose, which moves with the cup.
+    """
 
     hold: Hold = EMPTY
     pose: Pose | None = None
@@ -419,9 +422,15 @@ def make_engine(
     drive: Servo | None = None,
     time_step: float | None = None,
 ) -> Engine:
-    """Create the engine with this name; the options are explained in :class:`.Simulation`.
+    """Create the engine with this name.
 
-    ``time_step`` (s) is used if ``physics`` has none; None for the engine's default.
+    Args:
+        name: Name of the engine.
+        gui: Whether to open a window.
+        renderer: Renderer of the pictures; None for the engine's default.
+        physics: Numerical settings of the engine; None for the engine's defaults.
+        drive: Servo drives of the motors; None for ideal drives.
+        time_step: Time step, s, if ``physics`` has none; None for the engine's default.
 
     Raises:
         ConfigurationError: If no engine has this name, or the engine does not support an option.

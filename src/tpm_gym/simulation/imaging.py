@@ -94,7 +94,11 @@ class Camera:
         return eye
 
     def following(self, point_p: FloatArray) -> Camera:
-        """Return the camera with its target in the world frame; ``point_p`` is point P (3,) m."""
+        """Return the camera with its target in the world frame.
+
+        If the camera follows the robot, its target is relative to point P. ``point_p`` is P (3,) m,
+        world frame.
+        """
         if not self.follows:
             return self
         return replace(self, target=tuple((self.target + point_p).tolist()), follows=False)
@@ -184,9 +188,12 @@ def metres(share: NDArray[Any]) -> NDArray[np.float32]:
 
 
 def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
-    """Paint soft shadows onto the table, straight below bodies, if the picture has a depth.
+    """Paint soft shadows onto the table, straight below bodies.
 
-    ``casters`` (k, 4) m has x, y, z (world) and radius of each body.
+    Args:
+        picture: Picture; its colours are changed. Without a depth, nothing is painted.
+        view: View of the picture.
+        casters: (k, 4) m: x, y, z (world) and radius of each body.
     """
     if picture.depth is None:
         return
@@ -208,7 +215,11 @@ def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
 def paint_markers(picture: Picture, view: View, centres: ArrayLike, radius: float) -> None:
     """Paint goal markers into a picture: translucent spheres that shine through bodies.
 
-    ``centres`` (k, 3) and ``radius`` of the spheres are in m, world.
+    Args:
+        picture: Picture, with or without a depth; its colours are changed.
+        view: View of the picture.
+        centres: (k, 3) m, world.
+        radius: Radius of the spheres, m.
     """
     camera = view.camera
     for centre in np.reshape(centres, (-1, 3)):

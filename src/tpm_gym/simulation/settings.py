@@ -17,8 +17,10 @@ _SHORTEST = 1e-6  # s; a control step with a shorter time step would take minute
 def settings_of(kind: type[T], name: str, value: Any) -> T:
     """Return settings as an instance of the dataclass ``kind``.
 
-    ``value`` is such an instance, a mapping of its fields, or None for the defaults. Error messages
-    call the option ``name``.
+    Args:
+        kind: Dataclass of settings.
+        name: Name of the option in error messages.
+        value: An instance of ``kind``, a mapping of its fields, or None for the defaults.
 
     Raises:
         ConfigurationError: If ``value`` is none of these, or has an unknown field or a field that

@@ -70,7 +70,7 @@ def safe_points(
         near_singularity: Whether the points must be just above the threshold of safe conditioning.
 
     Returns:
-        The known and the drawn points by name, (r, 3) m each.
+        The known and the drawn points by name, (r, 3) m each, machine's frame.
 
     Raises:
         ConfigurationError: If no draw meets these conditions.

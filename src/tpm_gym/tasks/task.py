@@ -184,8 +184,9 @@ class Task(ABC):
                 result contains them unchanged, and sampled positions keep clear of them.
 
         Returns:
-            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m, from
-            -2 to 2 m, as the observation space. With a belt, also ``"belt_speed"`` (r, 1) m/s.
+            Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. The
+            observation space limits goals to coordinates from -2 to 2 m. With a belt, also
+            ``"belt_speed"`` (r, 1) m/s.
         """
 
     def achieved(self, state: State) -> FloatArray:
@@ -281,7 +282,10 @@ class Task(ABC):
     def start(
         self, rngs: Sequence[np.random.Generator], options: Any = None
     ) -> dict[str, FloatArray]:
-        """Sample the starts of r episodes as :meth:`sample`, and apply ``reset(options=...)``.
+        """Sample the starts of r episodes, and apply ``reset(options=...)``.
+
+        Returns:
+            As :meth:`sample`.
 
         Raises:
             ResetOptionError: If an option is unknown, is not a finite array of the right shape, or
@@ -354,13 +358,20 @@ class Task(ABC):
         return points
 
     def starts_of(self, block: Block | None) -> tuple[FloatArray, FloatArray]:
-        """Return low and high corner (3,) m of the starts of a block; default: :meth:`reach_of`."""
+        """Return the low and high corners (3,) m, world, of the places where a block may start.
+
+        The default is :meth:`reach_of`. A task with other starts overrides this method.
+        """
         return self.reach_of(block)
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the boxes of a block's goals, or of P's for None; by default :meth:`reach_of`.
+        """Return the boxes in which goals lie, as low and high corners (3,) m, world, each.
 
-        Each box is a pair of low and high corner (3,) m.
+        By default there is one box: the reach of point P, or of a block in the cup. A task with
+        goals elsewhere overrides this method.
+
+        Args:
+            block: Block that has to reach the goals; None for goals of point P.
         """
         return [self.reach_of(block)]
 

@@ -41,7 +41,10 @@ def open_viewer(
 ) -> Viewer:
     """Start a viewer in the background; ``.address`` is its page and ``.close()`` ends it.
 
-    Arguments are those of :class:`ViewConfig`; ``machine`` may also be a ``Machine``.
+    Args:
+        machine: Name of a machine, or a machine.
+        host: Address to listen on.
+        port: Port to listen on; if it is taken, the next free one.
 
     Raises:
         MissingPackageError: If viser is not installed.
@@ -53,7 +56,12 @@ def open_viewer(
 
 
 def run(config: ViewConfig) -> None:
-    """Run ``tpm-gym view``: serve until Ctrl-C, or export a page; errors as :func:`open_viewer`."""
+    """Run ``tpm-gym view``: serve until Ctrl-C, or export a page.
+
+    Raises:
+        MissingPackageError: If viser is not installed.
+        ConfigurationError: If no machine has this name, or an option is not possible.
+    """
     if config.export is not None:
         print("playing an episode for the page ...", file=sys.stderr, flush=True)
         from tpm_gym.viewer.export import export

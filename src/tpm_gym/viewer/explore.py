@@ -32,7 +32,7 @@ class Explore:
     Attributes:
         posture: The posture that is shown.
         problem: Reason why the requested posture does not exist; empty if it exists.
-        refusal: Message in the panel with the reason.
+        refusal: Element of the panel that shows this reason.
     """
 
     def __init__(

@@ -60,7 +60,11 @@ class Layers:
         self._keys: dict[str, Any] = {}
 
     def around(self, posture: Posture) -> Mapping[str, Found]:
-        """Return the layers of a posture by name: "region", and those of :meth:`Kind.layers`."""
+        """Return the available layers of a posture, by name.
+
+        These are the layer "region", with the boxes of the commands and of the goals, and the
+        layers that :meth:`Kind.layers` returns.
+        """
         machine = self._kind.machine
         regions = {"region": machine.region, "goals": machine.goal_region}
         return {"region": ("always", lambda: regions), **self._kind.layers(posture)}

@@ -39,8 +39,9 @@ class Play:
     Attributes:
         player: Player of the episode. None before the first episode, and after another machine,
             environment, engine or policy is chosen.
-        plots: Plots of the reward terms, and of the torques; one plot of each is visible.
-        status: Line below the buttons.
+        plots: Two dictionaries of plots: of the reward terms, and of the torques. In each, one plot
+            is visible.
+        status: Element of the panel that shows a line below the buttons.
     """
 
     def __init__(

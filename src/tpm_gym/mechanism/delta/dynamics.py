@@ -1,5 +1,7 @@
 """Dynamics of the Delta in closed form, without solver or iteration.
 
+    torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
+
 The model of the masses is exact for the bodies of :mod:`tpm_gym.mechanism.delta.bodies`:
 
 * arms turn about the motors' axes;
@@ -106,7 +108,13 @@ def gather(pose: Pose, force: Triple) -> Triple:
 
 
 def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
-    """Compute the upper triangle of M, by rows, from the kinetic energy and the rows ``j`` of J."""
+    """Compute the upper triangle of M, kg m^2, by rows, from the bodies' kinetic energy.
+
+    Args:
+        pose: Configuration.
+        j: Rows of the velocity Jacobian, m/rad.
+        m: Constants of the bodies.
+    """
     one, two, three = legs(pose, m)
     (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = j
     a, b, c = (xa, ya, za), (xb, yb, zb), (xc, yc, zc)  # velocities of P for unit rates
@@ -160,11 +168,19 @@ def _drift(leg: _Leg, v: Triple, rate: Numbers) -> Numbers:
 def _inertial(
     at: Pair, leg: _Leg, v: Triple, a: Triple, rate: Numbers, change: Numbers, gravity: Triple
 ) -> tuple[Triple, Numbers]:
-    """Compute the force at P (N) and the motor's torque (N m) for a leg's inertia and weight.
+    """Compute the force and the torque that a leg's inertia and weight require.
 
-    The velocity ``v`` of P (m/s) is in the leg's frame. The acceleration ``a`` of P, gravity (both
-    m/s^2) and the force are in the base's frame. ``rate`` (rad/s) and ``change`` (rad/s^2) are the
-    joint's velocity and acceleration.
+    Args:
+        at: Direction of the leg.
+        leg: The leg.
+        v: Velocity of P in the leg's frame, m/s.
+        a: Acceleration of P in the base's frame, m/s^2.
+        rate: Joint velocity, rad/s.
+        change: Joint acceleration, rad/s^2.
+        gravity: Gravity in the base's frame, m/s^2.
+
+    Returns:
+        The force at P in the base's frame, N, and the torque of the leg's motor, N m.
     """
     cos, sin, (x, y, z), motor, weight, couple, swing = leg
     (ax, _, az), (gx, gy, gz) = inwards(at, a), inwards(at, gravity)

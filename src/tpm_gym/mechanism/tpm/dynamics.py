@@ -1,5 +1,7 @@
 """The dynamics of the mechanism in closed form, without solver or iteration.
 
+    torque = M(theta) theta_ddot + C(theta, theta_dot) theta_dot + g(theta)
+
 The coupling degree is zero, so there are formulas for position, velocity and acceleration of every
 point. The closures |B_iC_i| = l4, differentiated twice, give the accelerations of C1 and then of P
 from the accelerations of B_i, each by one division (:func:`_resolve`). Forces of inertia and weight
@@ -88,8 +90,13 @@ def pose_at(
 def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Inertia) -> Triple:
     """Compute the motors' torques, N m.
 
-    ``rates`` (rad/s) and ``changes`` (rad/s^2) are joint velocities and accelerations. Subtracting
-    ``gravity`` (m/s^2) from the accelerations of all points has the same effect as adding weights.
+    Args:
+        pose: Configuration.
+        rates: Joint velocities, rad/s.
+        changes: Joint accelerations, rad/s^2.
+        gravity: Acceleration of gravity in the machine's frame, m/s^2. Subtracting it from the
+            accelerations of all points has the same effect as adding the weights.
+        m: Constants of the bodies.
     """
     turn, moved = velocities(pose, rates)
     elbows, (cx, cz), (px, py, pz) = accelerations(pose, rates, changes, turn, moved)
@@ -122,9 +129,12 @@ def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Iner
 
 
 def masses(pose: Pose, j: tuple[Triple, Triple, Triple], m: Inertia) -> tuple[Numbers, ...]:
-    """Compute the upper triangle of M, by rows, from the bodies' kinetic energy.
+    """Compute the upper triangle of M, kg m^2, by rows, from the bodies' kinetic energy.
 
-    ``j`` has the rows of the Jacobian. Motor 3 moves neither C1 nor the height of P.
+    Args:
+        pose: Configuration.
+        j: Rows of the velocity Jacobian, m/rad; motor 3 moves neither C1 nor the height of P.
+        m: Constants of the bodies.
     """
     (c1, c2, c3), (s1, s2, s3), f = pose.cos, pose.sin, pose.factors
     (r1x, r1y, r1z), (_, _, r2z), (r3x, r3y, r3z) = pose.rods
@@ -230,7 +240,13 @@ def _resolve(pose: Pose, h1: Numbers, h2: Numbers, h3: Numbers) -> Triple:
 
 
 def gather(pose: Pose, at_c: _Pair, at_p: Triple) -> Triple:
-    """Compute the motor torques (N m) that exert a force at C1 (N, x and z) and at P (N)."""
+    """Compute the motor torques (N m) that exert a force at C1 and a force at P.
+
+    Args:
+        pose: Configuration.
+        at_c: Force at C1 along x and z, N.
+        at_p: Force at P, N.
+    """
     (r1x, _, r1z), (r2x, _, r2z), (r3x, _, r3z) = pose.rods
     (cx, cz), (px, py, pz), f = at_c, at_p, pose.factors
     rod3 = (f.cos_beta * py - f.sin_beta * px) * pose.per_k  # its force, over l4

@@ -39,7 +39,13 @@ class Course(NamedTuple):
 
 
 class IdealSteps:
-    """Ideal drives with limited torques; the arguments are explained in :func:`ideal_step`."""
+    """Ideal drives with limited torques.
+
+    Args:
+        references: (K, r, 3) rad, joint positions at the ends of the time steps.
+        effort: (r, 3) N m, largest torques.
+        step: Time step, s.
+    """
 
     def __init__(self, references: FloatArray, effort: FloatArray, step: float) -> None:
         """Store the arguments; no motor has been at its limit yet."""
@@ -112,7 +118,7 @@ def march(
         steps: Drives of the robots.
         count: Number of time steps, K.
         course: State of the robots at the beginning.
-        touch: Function that moves objects and cups.
+        touch: Function that moves objects and cups, and returns forces on P and carried masses.
 
     Returns:
         State of the robots at the end, and the torques (K, r, 3) N m in all time steps.

@@ -83,7 +83,10 @@ def pass_through(
     course: Course,
     touch: Touch,
 ) -> tuple[Course, FloatArray]:
-    """Compute time steps of robots with ideal drives, as :func:`.forward_dynamics.march` does."""
+    """Compute ``count`` time steps of r robots with ideal drives.
+
+    Arguments and results are explained in :func:`.forward_dynamics.march`.
+    """
     torques, step = np.empty((count, *course.theta.shape)), steps.step
     speed = (course.position - course.before) / step
     for index in range(count):

@@ -237,11 +237,16 @@ def modes_left(
 
 @compiled
 def resisted(mass: Symmetric, impulse: Vector, limit: Vector) -> Vector:
-    """Compute the joint velocities u after an impulse (N m s), with Coulomb friction.
+    """Compute the joint velocities u (rad/s) after an impulse, with Coulomb friction.
 
-    mass @ u = impulse - resistance, with mass in kg m^2. The resistance of a joint is
-    limit * sign(u); if u is 0, its size is at most limit (N m s, zero or more). So u minimises
+    mass @ u = impulse - resistance. The resistance of a joint is limit * sign(u); if u is 0, the
+    size of the resistance is at most limit. So u minimises
     u @ mass @ u / 2 - impulse @ u + limit @ |u|.
+
+    Args:
+        mass: Inertia, kg m^2.
+        impulse: N m s.
+        limit: N m s, zero or more.
     """
     found = solved(mass, impulse)
     if limit[0] != 0 or limit[1] != 0 or limit[2] != 0:

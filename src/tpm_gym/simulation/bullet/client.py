@@ -27,8 +27,12 @@ class Client:
     """Physics client: pybullet's functions with the argument ``physicsClientId`` filled in.
 
     It replaces BulletClient of pybullet_utils. It looks up each function only once, which halves
-    the time of the cheaper calls, and it prints nothing. The arguments are those of
-    :class:`.BulletEngine`.
+    the time of the cheaper calls, and it prints nothing.
+
+    Args:
+        physics: Numerical settings.
+        gui: Whether to open PyBullet's window.
+        renderer: ``"tiny"`` or None draws on the CPU; ``"egl"`` draws on a GPU.
 
     Attributes:
         number: PyBullet's id of the client.

@@ -23,7 +23,14 @@ class Cup:
     """Vacuum cup on a robot's platform; it can hold one object.
 
     The weld keeps a gap of 20 um between lip and object. Without a gap, their contact would act
-    against the weld. ``bodies`` are the body ids of the objects ``blocks``; ``time_step`` is in s.
+    against the weld.
+
+    Args:
+        client: Physics client.
+        robot: Robot with the cup.
+        bodies: Body ids of the objects.
+        blocks: Objects of the scene.
+        time_step: Time step, s.
 
     Attributes:
         grip: Held object, and its pose in the frame at the centre of mass of the cup's link.

@@ -104,9 +104,6 @@ class _Motion(NamedTuple):
 class Friction:
     """Friction of objects on their tables and under the cup.
 
-    In the methods, ``motion`` is the motion of an object, ``other`` the motion of the body that it
-    touches, and ``points`` are PyBullet's contact points between them.
-
     Args:
         bodies: Body ids of the objects.
         tables: Body ids of the tables, one per object, because objects slide in different
@@ -246,7 +243,14 @@ class Friction:
 
         Friction that is missing in one time step is not always missing in the next: an impact lasts
         one time step, and a slip can reverse. So the missing friction of the last two time steps is
-        compared, and the smaller value is added. ``face`` is None if the other body is an object.
+        compared, and the smaller value is added.
+
+        Args:
+            motion: Motion of the object.
+            other: Motion of the body that the object touches.
+            points: PyBullet's contact points.
+            coefficient: Coulomb's coefficient.
+            face: Face of the other body; None if the other body is an object.
         """
         slips = [_slip(motion, other, point) for point in points]
         if face is not None:
@@ -283,7 +287,13 @@ class Friction:
 
         All contact points at upright faces are treated as one contact, at the point with the
         largest force. An impact lasts only one time step. So the friction is limited to the smaller
-        one of the limits of the last two time steps. ``other`` is the lip or object that pushes.
+        one of the limits of the last two time steps.
+
+        Args:
+            motion: Motion of the object.
+            other: Motion of the lip or object that pushes it.
+            points: PyBullet's contact points.
+            coefficient: Coulomb's coefficient of the contact.
         """
         points = _beside(points)
         point = max(points, key=lambda point: point[9])
@@ -348,9 +358,13 @@ def _slip(motion: _Motion, other: _Motion, point: Any) -> _Slip:
 def _lack(
     motion: _Motion, slips: Sequence[_Slip], points: Sequence[Any], coefficient: float
 ) -> _Wrench:
-    """Compute Coulomb's friction of the points that slip, minus the solver's friction.
+    """Compute Coulomb's friction (N, N m) of the points that slip, minus the solver's friction.
 
-    The forces of ``points`` are those of the last time step.
+    Args:
+        motion: Motion of the object.
+        slips: Slip of each point.
+        points: PyBullet's contact points, with the forces of the last time step.
+        coefficient: Coulomb's coefficient.
     """
     solved = [_solved(point) for point in points]
     # PyBullet returns the friction on either body. It opposes the slip.
@@ -391,6 +405,11 @@ def _scales(
     """Return the friction limits along x and y (world), divided by mu times the normal force.
 
     Points of a spinning object slip in different directions, but share the scales.
+
+    Args:
+        slips: Slip of each point.
+        points: PyBullet's contact points.
+        coefficient: Coulomb's coefficient.
     """
     along_x = along_y = speed = total = 0.0
     for (x, y, _, fast), point in zip(slips, points, strict=True):

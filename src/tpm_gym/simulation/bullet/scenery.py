@@ -62,9 +62,13 @@ class Scenery:
                     client.setCollisionFilterPair(body, top, -1, -1, int(index == other))
 
     def _add_slab(self, slab: Slab, low: float, high: float, width: float) -> int:
-        """Add a static board from ``low`` to ``high`` (m) along x, and return its body id.
+        """Add a static board, and return its body id.
 
-        ``width`` is half the width along y, m.
+        Args:
+            slab: Thickness, height, colour and friction of the board.
+            low: Lower end along x, m.
+            high: Upper end along x, m.
+            width: Half the width along y, m.
         """
         half, height = ((high - low) / 2, width, slab.half_height), slab.top - slab.half_height
         body = self._add_box(half, ((low + high) / 2, 0.0, height), slab.colour)

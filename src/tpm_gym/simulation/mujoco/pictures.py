@@ -30,7 +30,10 @@ _open: weakref.WeakSet[Pictures] = weakref.WeakSet()
 class Pictures:
     """Renderer of the scene. It opens an OpenGL context for the first picture of each size.
 
-    The argument ``renderer`` is explained in :class:`.MujocoEngine`.
+    Args:
+        renderer: One of :data:`RENDERERS`. If None, the environment variable ``MUJOCO_GL`` names
+            the renderer. If the variable has none of these names, the first renderer that works is
+            used.
 
     Raises:
         ConfigurationError: If ``renderer`` is neither None nor one of :data:`RENDERERS`.
@@ -127,7 +130,11 @@ def aim(own: mujoco.MjvCamera, camera: Camera) -> None:
 
 
 def _opengl(renderer: str | None, width: int, height: int) -> Any:
-    """Open an OpenGL context for pictures of this size; ``renderer`` is as in :class:`Pictures`."""
+    """Open an OpenGL context for pictures of this size.
+
+    If ``renderer`` is None, the environment variable ``MUJOCO_GL`` names the backend. If the
+    variable has none of the names in :data:`RENDERERS`, the first backend that works is used.
+    """
     asked = renderer or os.environ.get("MUJOCO_GL", "").lower()
     names = [asked] if asked in RENDERERS else RENDERERS
     found = (_context(name, width, height) for name in names)

@@ -193,5 +193,8 @@ def _slot(found: kinematics.RotatedPostures, slot: int) -> kinematics.RotatedPos
 
 
 def _working(serial: FloatArray) -> kinematics.WorkingMode:
-    """Return the working mode whose signs are those of the factors (4,) of serial singularities."""
+    """Return the working mode whose four signs are those of the values ``serial`` (4,).
+
+    ``serial`` has the factors that are zero at serial singularities.
+    """
     return kinematics.WORKING_MODES[int(((serial > 0) * [8, 4, 2, 1]).sum())]

@@ -118,8 +118,13 @@ def collide_objects(
 ) -> int:
     """Add contacts of objects with each other and with the table; return the number of contacts.
 
-    ``held`` is the index of the held object; -1 for none. ``polygons`` is scratch memory, and
-    ``count`` is the number of contacts at the call.
+    Args:
+        objects: (k,) objects.
+        held: Index of the held object; -1 for none.
+        setting: Constants of the simulation.
+        polygons: (2, 12, 3) m, scratch memory.
+        contacts: Output.
+        count: Number of contacts at the call.
     """
     slot = len(objects) * (TABLE_SLOTS + LIP_SLOTS)
     for j in range(len(objects)):
@@ -173,8 +178,13 @@ def collide_lip(
 ) -> int:
     """Find contacts of the lip with all objects except the held object; return their number.
 
-    ``held`` is the index of the held object; -1 for none. ``lip`` is the centre of the lip (m,
-    world), and ``near`` is the largest gap of a contact, m.
+    Args:
+        objects: (k,) objects.
+        held: Index of the held object; -1 for none.
+        lip: Centre of the lip, m, world.
+        near: Largest gap of a contact, m.
+        setting: Constants of the simulation.
+        contacts: Output.
     """
     count = 0
     for i in range(len(objects)):
@@ -307,8 +317,12 @@ def _touch_face(
 def _overlap(box: _Box, first: int, second: int, foot: Vector) -> tuple[float, float]:
     """Return the lowest and highest height (m) at which the lip's side touches a side face.
 
-    ``first`` and ``second`` are the object's axes that are parallel to the face. The heights are
-    above ``foot``, a point of the lip's rim relative to the object's centre, m.
+    Args:
+        box: Object.
+        first: Index of one of the two axes of the object that are parallel to the face.
+        second: Index of the other axis.
+        foot: Point of the lip's rim, relative to the object's centre, m; the heights are above this
+            point.
     """
     low, high = 0.0, CUP.bellows
     for k in (first, second):

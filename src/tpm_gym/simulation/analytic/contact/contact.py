@@ -26,8 +26,13 @@ from tpm_gym.simulation.state import Belt, Block
 class Reading(NamedTuple):
     """State of the k objects and the cup on each of n tables, in the world frame.
 
-    The attributes are those of :class:`.Readout`, which begin with ``object_`` there if they belong
-    to objects.
+    Attributes:
+        position: (n, k, 3) m, centres of the objects.
+        quaternion: (n, k, 4), orientations (x, y, z, w) of the objects.
+        velocity: (n, k, 3) m/s, velocities of the objects.
+        angular_velocity: (n, k, 3) rad/s, angular velocities of the objects.
+        held: (n,) index of the object in the cup; -1 for none.
+        vacuum: (n,) Pa below the ambient pressure.
     """
 
     position: FloatArray
@@ -46,7 +51,7 @@ class Contact:
         count: Number of tables, n.
         time_step: Time step, s.
         table: Half edge lengths of the tables along x and y, m.
-        frame: Factors and origin (m) of :attr:`.Mount.frame`.
+        frame: Factors and origin (m) that convert the machine's frame to the world frame.
         belt: Belt of each table; None for none.
     """
 
@@ -73,7 +78,13 @@ class Contact:
         self.place(everything, middle)
 
     def alter(self, rows: Any, mass_factor: FloatArray, friction_factor: FloatArray) -> None:
-        """Multiply the objects' nominal masses and friction on r tables by factors (r,) each."""
+        """Set the objects' masses and friction coefficients on some tables.
+
+        Args:
+            rows: Indices of the r tables.
+            mass_factor: (r,) factors of the nominal masses.
+            friction_factor: (r,) factors of the nominal friction coefficients.
+        """
         for name, factor in (("mass", mass_factor), ("friction", friction_factor)):
             nominal = np.array([getattr(block, name) for block in self._blocks])
             self._tables.objects[name][rows] = factor[:, None] * nominal

@@ -62,8 +62,13 @@ def breathe(
 ) -> None:
     """Apply the vacuum law after a time step: update the vacuum, hold or release an object.
 
-    ``on`` is whether the vacuum is on, and ``seal`` is the force of the cup on the held object (N,
-    world). Objects and cup are changed.
+    Args:
+        objects: (k,) objects; changed.
+        cup: Cup; changed.
+        way: Motion of point P.
+        on: Whether the vacuum is on.
+        seal: Force of the cup on the held object, N, world.
+        setting: Constants of the simulation.
     """
     held, lip, touched = int(cup["held"]), lip_of(way.then, cup["slide"]), -1
     if on and held < 0:

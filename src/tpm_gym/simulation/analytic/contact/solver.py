@@ -98,10 +98,14 @@ def _speed(body: Record, arm: Vector) -> Vector:
 def prepare(
     contacts: Records, count: int, bodies: Records, forces: FloatArray, step: float
 ) -> None:
-    """Compute the constants of ``count`` contacts, and apply the impulses of the last time step.
+    """Compute the constants of all contacts, and apply the impulses of the last time step.
 
-    The contacts and the velocities of the bodies are changed. ``forces`` (slots, 3) N are the
-    contact forces of the last time step, and ``step`` is the time step, s.
+    Args:
+        contacts: Contacts, of which the first ``count`` are used; changed.
+        count: Number of contacts.
+        bodies: Bodies of the contacts; their velocities are changed.
+        forces: (slots, 3) N, contact forces of the last time step.
+        step: Time step, s.
     """
     for j in range(count):
         contact = contacts[j]
@@ -175,10 +179,15 @@ def _relax(contact: Record, bodies: Records) -> bool:
 
 @compiled
 def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bool) -> None:
-    """Compute the impulses of contacts and spring, and apply them to the bodies.
+    """Compute the contact impulses and the spring's impulse, and apply them to the bodies.
 
-    Call :func:`prepare` first. If ``calm``, stop as soon as all objects are :func:`still`, because
-    the impulses then balance all forces.
+    Args:
+        contacts: Contacts after :func:`prepare`, of which the first ``count`` are used; changed.
+        count: Number of contacts.
+        bodies: Bodies of the contacts; their velocities are changed.
+        motor: Spring that drives body 0, the cup.
+        calm: Whether to stop as soon as all objects are :func:`still`, because the impulses then
+            balance all forces.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
     for sweep in range(_SWEEPS):

@@ -89,8 +89,9 @@ class Setting(NamedTuple):
             x, and highest y (half of the width).
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
-        turn: Factors of :attr:`.Mount.frame`.
-        origin: Origin of :attr:`.Mount.frame`, m.
+        turn: Signs (1 or -1). The components of a vector in the machine's frame times these signs
+            are its components in the world frame.
+        origin: Origin of the machine's frame in the world frame, m.
     """
 
     half: FloatArray

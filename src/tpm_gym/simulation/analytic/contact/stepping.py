@@ -61,7 +61,7 @@ def advance(
         tables: State of the objects and cups of all robots; changed.
         earlier: Output: the state of the simulated robots at the beginning of the control period.
         rows: (r,) indices of the robots to simulate.
-        path: Motion of point P of these robots.
+        path: Motion of point P of these robots, in all time steps of the control period.
         on: (r,) whether the vacuum is on.
         push: (r, w, 3) N, force on the platform in each of the final w time steps of ``path``,
             machine's frame; output, initially zero.
@@ -118,7 +118,13 @@ def read(
 def place(tables: Tables, rows: IntArray, poses: FloatArray, setting: Setting) -> None:
     """Release held objects, and place all objects with zero velocity.
 
-    Details and arguments are explained in :meth:`.contact.Contact.place`.
+    :meth:`.contact.Contact.place` explains the details.
+
+    Args:
+        tables: State of the objects and cups of all robots; changed.
+        rows: (r,) indices of the tables.
+        poses: (r, k, 7) centres (m) and orientations (x, y, z, w) of the objects, world.
+        setting: Constants of the simulation.
     """
     for i in range(len(rows)):
         row, standing = rows[i], tables.belts[rows[i]] == 0
