@@ -2,6 +2,7 @@
 
 import time
 from contextlib import closing
+from dataclasses import replace
 from html import escape
 from itertools import product
 from typing import Any, ClassVar
@@ -165,6 +166,15 @@ def test_another_machine_is_shown_at_its_home(viewer):
     assert viewer.explore.posture.machine is tpm_gym.PAPER_TPM
     assert viewer.explore.posture.position == pytest.approx(tpm_gym.PAPER_TPM.home)
     assert drawn_gap(viewer) < 1e-9
+
+
+def test_a_machine_with_the_name_of_another_is_shown_beside_it():
+    heavier = replace(tpm_gym.PAPER_TPM, payload=2.0)
+    with closing(open_viewer(heavier, port=0)) as viewer:
+        assert viewer.machine.value == "paper (own)"
+        assert viewer.explore.posture.machine == heavier
+        choose(viewer, viewer.machine, "paper")
+        assert viewer.explore.posture.machine is tpm_gym.PAPER_TPM
 
 
 def test_a_delta_is_dragged_turned_and_plays_the_expert(viewer):

@@ -439,10 +439,11 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
         raise ConfigurationError("name", name, "a name")
     if not isinstance(machine, Machine) and not callable(machine):
         raise ConfigurationError("machine", machine, "a tpm_gym.Machine, or what makes one")
-    old = _MACHINES.get(name, machine)
-    if old != machine and not _defined_again(old, machine):
+    old = _MACHINES.get(name)
+    if old is None or _defined_again(old, machine):
+        _MACHINES[name] = machine
+    elif old != machine:
         raise ConfigurationError("machine", name, f"a name other than {', '.join(_MACHINES)}")
-    _MACHINES[name] = machine
 
 
 def _defined_again(old: Any, new: Any) -> bool:

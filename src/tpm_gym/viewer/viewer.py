@@ -11,7 +11,7 @@ from tpm_gym.errors import TPMError
 from tpm_gym.mechanism.machine import Machine, machine_names
 from tpm_gym.viewer import server
 from tpm_gym.viewer.explore import Explore, units
-from tpm_gym.viewer.kinds import Posture, find_kind
+from tpm_gym.viewer.kinds import Kind, Posture, find_kind
 from tpm_gym.viewer.layers import BEST, LAYERS, MAP, Layers
 from tpm_gym.viewer.play import Play
 from tpm_gym.viewer.player import Player
@@ -32,7 +32,7 @@ class Viewer:
 
     def __init__(self, machine: str | Machine, host: str, port: int) -> None:
         """Start the server, and show the machine at its home."""
-        first = find_kind(machine)
+        first, self._kinds = _named_kinds(machine)
         self.server = server.start(host, port)
         self.worker = Worker(self._report)
         gui = self.server.gui
@@ -43,10 +43,7 @@ class Viewer:
             brand_color=(9, 105, 218),
         )
         gui.main_panel.dock_right()
-        known = map(find_kind, machine_names())
-        self._kinds = {kind.machine.name: kind for kind in (*known, first)}
-        names = tuple(self._kinds)
-        self.machine = gui.add_dropdown("Machine", names, initial_value=first.machine.name)
+        self.machine = gui.add_dropdown("Machine", tuple(self._kinds), initial_value=first)
         self._numbers: Any = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Explore"):
@@ -117,6 +114,22 @@ class Viewer:
         self.play.tell(escape(str(error)))
         for client in self.server.get_clients().values():
             client.add_notification("That did not work", str(error), color="red")
+
+
+def _named_kinds(machine: str | Machine) -> tuple[str, dict[str, Kind]]:
+    """Return the name of ``machine``, and the kinds of it and of all registered machines by name.
+
+    The registered name counts: several machines may have one ``Machine.name``.
+    """
+    given = find_kind(machine)
+    kinds = {name: find_kind(name) for name in machine_names()}
+    if isinstance(machine, str):
+        return machine, kinds
+    for name, kind in kinds.items():
+        if kind.machine == machine:
+            return name, kinds
+    name = f"{machine.name} (own)" if machine.name in kinds else machine.name
+    return name, {**kinds, name: given}
 
 
 def numbers(posture: Posture) -> str:
