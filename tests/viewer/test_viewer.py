@@ -169,7 +169,7 @@ def test_another_machine_is_shown_at_its_home(viewer):
 
 
 def test_a_machine_with_the_name_of_another_is_shown_beside_it():
-    heavier = replace(tpm_gym.PAPER_TPM, payload=2.0)
+    heavier = replace(tpm_gym.PAPER_TPM, payload=2.5)
     with closing(open_viewer(heavier, port=0)) as viewer:
         assert viewer.machine.value == "paper (own)"
         assert viewer.explore.posture.machine == heavier
