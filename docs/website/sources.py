@@ -43,7 +43,7 @@ def mark(text: str, page: str) -> str:
 
     def replace(link: re.Match[str]) -> str:
         path = posixpath.normpath(posixpath.join(folder, link["path"]))
-        if path.startswith("docs/") and path.endswith((".md", ".png", ".webp")):
+        if path.startswith("docs/") and path.endswith((".md", ".png", ".gif", ".webp")):
             return link[0]
         if not (ROOT / path).exists():
             return link[0]  # Sphinx reports it
