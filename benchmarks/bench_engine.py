@@ -44,7 +44,7 @@ from tpm_gym.learning.rollout import TEST_SEED
 PICK, JOINTS, REACH = "TPMPickAndPlace-v0", "TPMPickAndPlaceJoints-v0", "TPMReach-v0"
 PEER = "PandaPickAndPlace-v3"
 COUNTS = (1, 16, 256, 1024, 4096)
-THREADED = {"ideal": (2048, 4096, 16384, 65536, 262144), "servo": (2048, 4096, 16384)}
+THREADED = {"ideal": (4096, 16384, 65536, 262144), "servo": (4096, 16384)}
 """Numbers of environments that two threads step, by drive."""
 ROUNDS, SINGLE, STEPS = 7, 300, 50
 """Rounds of timing, control steps of a block of one environment, steps of an episode."""

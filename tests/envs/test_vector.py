@@ -198,7 +198,7 @@ def test_what_is_saved_goes_on_equally(randomisation):
             assert_same(again.step(actions)[0], wanted[0])
 
 
-@pytest.mark.parametrize(("count", "threads"), [(6, 1), (2047, 1), (2048, 2), (2049, 2)])
+@pytest.mark.parametrize(("count", "threads"), [(6, 1), (4095, 1), (4096, 2), (4097, 2)])
 def test_threads_have_as_many_environments_as_are_worth_it(count, threads):
     envs, alone = (make(PICK, count, num_threads=number) for number in (64, 1))
     assert_same(*(each.reset(seed=0) for each in (envs, alone)))

@@ -131,7 +131,12 @@ class Shield:
         return self.least + TOLERANCE / 2 - _lowest_on_path(self._machine, corners)
 
     def _nearest(self, corners: FloatArray) -> FloatArray:
-        """Return the safe commands (r, 3) m nearest to the corners d."""
+        """Return the safe commands (r, 3) m nearest to the wanted commands.
+
+        Args:
+            corners: (r, 3, 3) m, the points b, c and d of each path, as at the top of this file. d
+                is the wanted command.
+        """
         last, found = corners[:, 1], corners.copy()
         of = Problem(
             self._control.scaled(corners[:, 2]),

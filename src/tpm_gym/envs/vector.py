@@ -35,7 +35,7 @@ from tpm_gym.simulation.state import State
 from tpm_gym.tasks.task import Task
 
 _MOST = 10**6  # largest number of environments; those of pick-and-place take some 10 GB
-_FEWEST = 1024  # smallest number of environments for each of several threads
+_FEWEST = 2048  # smallest number of environments for each of several threads
 
 Step = tuple[Observation, FloatArray, BoolArray, BoolArray, dict[str, Any]]
 
@@ -53,8 +53,8 @@ class TPMVectorEnv(VectorEnv[Observation, NDArray[Any], NDArray[Any]]):
         engine: ``"analytic"`` computes all environments together. With other engines, each
             environment has its own engine, and the environments are stepped one after another.
         num_threads: Largest number of threads that step the environments of the analytic engine.
-            Several threads are used only if each of them steps at least 1,024 environments, because
-            one thread is faster with fewer.
+            Several threads are used only if each of them steps at least 2,048 environments. With
+            fewer, they gain little or are slower.
         max_episode_steps: Steps after which an episode is truncated; None for no limit.
         autoreset_mode: Time of the reset after the end of an episode: ``NEXT_STEP``, ``SAME_STEP``
             (with ``final_obs`` and ``final_info`` in the infos), or ``DISABLED`` (the user calls

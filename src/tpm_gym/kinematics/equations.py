@@ -96,7 +96,7 @@ class Factors(NamedTuple):
 
     @property
     def parallel(self) -> FloatArray:
-        """(..., 3), factors of det A: sin_beta, level3, planar."""
+        """(..., 3), factors of det A: ``sin_beta``, ``level3``, ``planar`` of this class."""
         found: FloatArray = namespace_of(self.planar).stack(self[:3])
         return found
 

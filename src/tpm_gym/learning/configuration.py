@@ -361,7 +361,7 @@ def check_least(config: Any, least: int, *names: str) -> None:
 
 
 def check_seed(seed: int, count: int) -> None:
-    """Raise ConfigError if one of ``count`` seeds, ``seed`` and the next ones, is not allowed.
+    """Raise ConfigError if a seed from ``seed`` to ``seed + count - 1`` is not allowed.
 
     Seeds are not allowed if they are negative or held out for evaluations.
     """

@@ -219,7 +219,7 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _shown(config: EvaluationConfig) -> dict[str, str]:
-    """Return the conditions for table and JSON; without a shield, it is left out."""
+    """Return the conditions for table and JSON; ``shield`` is among them only if there is one."""
     found = _conditions(config.env, config.env_options.given())
     return {name: str(value) for name, value in found.items() if value is not False}
 

@@ -207,7 +207,7 @@ def _kinematics(equations: Equations) -> dict[Callable[..., None], int]:
         _put(block.found, 0, j, angles, real)
 
     def forward(block: _Block, j: int) -> None:
-        """Compute P (3 columns) at joint positions, in the modes of the machine."""
+        """Compute P of row j from its joint positions, in the modes of the machine."""
         at, _, working = pose(get(block.given, 0, j), block.modes, lengths(block.own, j))
         _put(block.found, 0, j, position_of(at), working)
 

@@ -447,9 +447,9 @@ def register_machine(name: str, machine: Machine | Callable[[], Machine]) -> Non
 
 
 def _defined_again(old: Any, new: Any) -> bool:
-    """Return whether ``new`` comes from a second definition of the class or callable of ``old``.
+    """Return whether a class or callable was defined a second time, under its old name.
 
-    This is so if the two classes or callables differ, but have the same name and module.
+    For machines, their classes are compared. The module has to be the same, too.
     """
     kinds = [type(value) if isinstance(value, Machine) else value for value in (old, new)]
     first, second = (getattr(kind, "__qualname__", None) for kind in kinds)

@@ -1,4 +1,4 @@
-"""Check that a task can start, and that a state has equal results alone and in a batch."""
+"""Checks: a task can start, and computes the same for a state alone as for it in a batch."""
 
 from __future__ import annotations
 

@@ -36,10 +36,10 @@ CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_to
 SHARES: Final = (0.65, 0.1, 0.65)
 """Acceleration limits along x, y, z: shares of P's largest acceleration along each axis alone."""
 BRAKING: Final = (0.8, 0.8, 0.25)
-"""Decelerations before the ends of the region, as shares of the accelerations.
+"""Decelerations along x, y, z before the ends of the region, as shares of the accelerations.
 
-Along x, the path ends close to the end of the region; along z, far from it. The motors must be
-able to brake along x and z at the same time.
+The motors must be able to brake along x and z at the same time. So the share along z is small:
+there, the path ends far from the end of the region, and P has a long way to brake.
 """
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""

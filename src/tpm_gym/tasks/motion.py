@@ -151,7 +151,7 @@ class Motion:
             yield Move(target() + (1 - down) * above - (1 - done) * way, bool(down > 0))
 
     def _overlapped(self, ways: list[FloatArray]) -> FloatArray:
-        """Return the fractions (n, k) of k ways that P has covered after each of n control steps.
+        """Return (n, k): the fraction of each of k ways that P has covered after n control steps.
 
         P follows the ways one after the other. Each way begins while P slows down on the previous
         way. The sum of the speeds of these two ways does not exceed the largest speed of one way.

@@ -310,7 +310,7 @@ class Task(ABC):
         return starts
 
     def _check_departures(self, goals: FloatArray) -> None:
-        """Raise if P cannot start as :meth:`departures` says."""
+        """Raise ConfigurationError if P cannot start at the points of :meth:`departures`."""
         if (departures := self.departures(goals)) is not None:
             region = self.machine.region
             points = finite("departures()", departures, (len(goals), 3), ConfigurationError)
@@ -396,7 +396,7 @@ class Task(ABC):
         return low, high
 
     def on_table(self, block: Block) -> Region:
-        """Return the flat goal region of P, machine's frame, where a held block is on the table."""
+        """Return the flat region of P, machine's frame, in which a held block touches the table."""
         low, high = self.machine.goal_region.low, self.machine.goal_region.high
         touching = hanging(block) + (0.0, 0.0, block.height / 2)
         level = float(self.machine.mount.to_paper(touching)[2])

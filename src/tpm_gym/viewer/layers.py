@@ -50,7 +50,7 @@ class Layers:
 
     Args:
         scene: Scene of a viser server.
-        kind: The machine with its modes; this object computes what the layers show.
+        kind: The machine with its modes. It computes what the layers show.
     """
 
     def __init__(self, scene: SceneApi, kind: Kind) -> None:

@@ -141,10 +141,10 @@ class Route(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Workspace of the solver; every time step overwrites it.
+    """Workspace of the solver for k objects; every time step overwrites it.
 
     Attributes:
-        bodies: (k + 2,) records of :data:`BODY`.
+        bodies: (k + 2,) records of :data:`BODY`: the cup, the objects, the belt.
         contacts: (slots(k),) records of :data:`CONTACT`.
         polygons: (2, 12, 3) m, corners of two polygons, to clip faces.
     """
