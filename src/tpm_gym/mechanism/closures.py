@@ -15,7 +15,7 @@ from tpm_gym.errors import ConfigurationError, SingularityError
 from tpm_gym.mechanism.bodies import Joint, Mechanism, Place, Solid
 
 CLOSED: Final = 1e-6
-"""Largest gap of a closed loop, m."""
+"""Gap below which a loop counts as closed, m: the distance between the two points of a closure."""
 
 _SOLIDS, _AXES, _JOINTS = (
     get_args(get_type_hints(kind)[name])
@@ -45,7 +45,10 @@ def closure_jacobian(mechanism: Mechanism, angles: Mapping[str, float]) -> Float
 
 
 def moving_joints(mechanism: Mechanism) -> list[str]:
-    """Return the names of the joints, in the order of the links, without the tool's slide."""
+    """Return the names of the joints, in the order of the links.
+
+    The slide of the cup (joint of the link ``mechanism.tool``) is left out.
+    """
     joints = (link.joint for link in mechanism.links if link.name != mechanism.tool)
     return [joint.name for joint in joints if joint]
 

@@ -153,7 +153,7 @@ class CompiledMachine(Machine):
     def built(
         self, lengths: tuple[float, ...] = (), link_masses: tuple[float, ...] = ()
     ) -> FloatArray:
-        """Return the lengths (m) and the constants of the dynamics as one array (k,).
+        """Return the lengths (m) and the constants of the dynamics as one array of k numbers, (k,).
 
         The arguments are explained in :class:`Machine`.
         """
@@ -167,7 +167,12 @@ class CompiledMachine(Machine):
         return self.built()[None], self._constants
 
     def _others(self, built: FloatArray, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the parameters of machines as built, and the constants that all machines share."""
+        """Return ``built`` (b, k) and the constants that all machines share.
+
+        Raises:
+            InputError: If a row of ``built`` does not have the k numbers of :meth:`built`, or if b
+                does not divide the number of rows of ``inputs`` (..., 3).
+        """
         rows, count = inputs.size // 3, len(built)
         if not count or rows % count:
             valid = f"parameters of b machines, with b a divisor of {rows} rows"

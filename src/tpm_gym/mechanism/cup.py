@@ -32,8 +32,8 @@ class VacuumCup(NamedTuple):
             lip is not sealed.
         least_vacuum: Remaining vacuum at which the lip comes off after the vacuum is switched off,
             Pa.
-        friction: Friction of the lip while it is not sealed. Its product with the object's friction
-            is the Coulomb coefficient between lip and object.
+        friction: Factor for the friction of the lip while it is not sealed. The Coulomb coefficient
+            between lip and object is this factor times the friction of the object.
         seal_friction: Coulomb coefficient of the sealed lip, for clean silicone on a smooth
             surface. Makers of cups assume 0.5 for dry metal, glass or wood.
         seal_gap: Largest distance between lip and object at which the vacuum seals, m.
@@ -61,7 +61,7 @@ class VacuumCup(NamedTuple):
         return (0.0, 0.0, self.length)
 
     def stem(self, point_p: Vector) -> Solid:
-        """Build the tube below point P (m, platform's frame) in which the cup slides."""
+        """Build the tube in which the cup slides, below ``point_p`` (m, platform's frame)."""
         x, y, z = point_p
         half = (self.length - self.bellows) / 2
         size = (0.005, 2 * half, 0.0)

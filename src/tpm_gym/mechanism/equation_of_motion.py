@@ -181,10 +181,10 @@ class EquationOfMotion(ABC):
     def _rows(
         self, text: Callable[..., Sequence[Numbers]], states: Mapping[str, ArrayLike]
     ) -> list[FloatArray]:
-        """Return the results of ``text`` for all rows of the arrays ``states``, (..., 3) each.
+        """Return the results of the function ``text`` for all rows of ``states``.
 
-        The first array is theta. The arguments of ``text`` are the configuration at theta, and then
-        the rows of the other arrays, in the arrays' order.
+        ``states`` contains arrays (..., 3) by name, first theta. The arguments of ``text`` are the
+        configuration at theta, and then the rows of the other arrays, in the arrays' order.
         """
 
         def results(values: tuple[Numbers, ...], ns: Namespace) -> list[Numbers]:

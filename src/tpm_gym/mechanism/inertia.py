@@ -5,12 +5,12 @@ A rigid bar from B to C has the kinetic energy of two coupled points:
     T = (a |vB|^2 + 2 b vB . vC + c |vC|^2) / 2,
     a = m (1 - s)^2 + I / l^2,  b = m s (1 - s) - I / l^2,  c = m s^2 + I / l^2.
 
-Here m is the mass of the bar, l its length, s l the distance of its centre of mass from B, and I
-its moment of inertia about an axis through the centre of mass, perpendicular to the bar.
+Here m is the mass of the bar, l is its length, and s * l is the distance from B to the centre of
+mass. I is the moment of inertia about an axis through the centre of mass, perpendicular to the bar.
 
-Arms (with a fixed near end) and rods are such bars. A body that only translates is a mass at the
-point with which it moves. Some bodies swing with their rods, and some rods also turn about their
-own axes; see :class:`Swing`.
+Arms and rods are such bars; one end of an arm is fixed. A body that only translates is a mass at
+the point with which it moves. Some bodies swing with their rods, and some rods also turn about
+their own axes; see :class:`Swing`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ROUNDING = 1e-9  # of a centre of mass, m; of two equal moments, relative
 
 
 class Swing(NamedTuple):
-    """Part of a leg's inertia that is not in the leg's bars.
+    """Part of a leg's inertia that the bars of the leg (see the module) do not include.
 
     The swing is the rotation of the rods in the plane of the arm. This part of the inertia has the
     kinetic energy T = ``(fixed + spin * out**2) * rate**2 / 2``. ``rate`` is the angular velocity
@@ -68,7 +68,10 @@ def swing_force(rod: Triple, rates: Triple, changes: tuple[Numbers, Numbers], m:
 
 
 class Bodies:
-    """Moving links by name, with factors of mass and inertia, and a record of the links in use."""
+    """Moving links by name, with factors of their mass and inertia.
+
+    ``known`` has the names of the links whose mass or inertia a method has read.
+    """
 
     def __init__(self, mechanism: Mechanism, factors: Sequence[float]) -> None:
         """Store one factor of mass and inertia for each moving link; 1 if ``factors`` is empty.

@@ -10,8 +10,8 @@ A loop takes five arguments:
 * ``results``: a tuple of arrays with n rows, which the loop fills; NaN where there is no solution.
 
 A row does not depend on the others. So a call with one row and a call with thousands of rows give
-this row equal results, bit for bit. Rows are copied to columns of a block, so that the compiler can
-compute several rows at a time.
+this row equal results, bit for bit. A loop copies the inputs of several rows (a block) to columns
+of an array, so that the compiled code can compute several rows at a time.
 """
 
 import math
@@ -50,9 +50,9 @@ class Equations(NamedTuple):
         position: (configuration) -> point P.
         regular: (configuration, lengths) -> whether J exists.
         velocity: (configuration) -> rows of J.
-        same_side: (configuration, point, modes, lengths) -> whether the point is on the assembly
-            mode's side. The function may use only the arms of the configuration, since the
-            mechanism may have no assembly.
+        same_side: (configuration, point, modes, lengths) -> whether the point is on the same side
+            of the parallel singularities as the assembly mode. The function may use only the arms
+            of the configuration, since the other parts may not exist.
         torques: (configuration, rates, changes, gravity, inertia) -> torques.
         gather: (configuration, force at P) -> torques J^T force.
         masses: (configuration, J, inertia) -> upper triangle of M.

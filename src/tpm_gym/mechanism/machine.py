@@ -200,7 +200,10 @@ class Machine(ABC):
         """Compute P, J and conditioning at ``theta`` (..., 3), in the machine's assembly mode."""
 
     def forward(self, theta: ArrayLike, built: FloatArray | None = None) -> FloatArray:
-        """Compute P (..., 3) m at ``theta`` (..., 3), in the machine's modes."""
+        """Compute P (..., 3) m at ``theta`` (..., 3), in the machine's assembly mode.
+
+        The result is NaN where the machine is not in its working mode or cannot be assembled.
+        """
         position = self.evaluate(theta, built).position
         left = self.mode_left(theta, position, built)
         return np.where(left[..., None], np.nan, position)
@@ -348,7 +351,8 @@ class Machine(ABC):
             theta: Joint positions (..., 3) rad (m for a slide).
             theta_dot: Joint velocities (..., 3) rad/s (m/s for a slide).
             theta_ddot: Joint accelerations (..., 3) rad/s^2 (m/s^2 for a slide).
-            force: Force on P (..., 3) N that the motors hold against; None for no force.
+            force: Force (..., 3) N that acts on P, in the machine's frame; None for no force. The
+                torques balance this force.
             built: Parameters of the machines, as for :meth:`inverse`.
         """
         motion = np.stack(np.broadcast_arrays(theta, theta_dot, theta_ddot), axis=-2, dtype=float)
@@ -407,7 +411,7 @@ class Machine(ABC):
         return np.array([*bodies.factors.values()])
 
     def occupied(self, position: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-        """Compute boxes around platform and tool: low and high corners, m, world.
+        """Compute a box around each solid of platform and cup: low and high corner, m, world frame.
 
         ``position`` is point P (3,) m, machine's frame.
         """

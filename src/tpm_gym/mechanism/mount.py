@@ -48,7 +48,7 @@ class Mount:
         return self.rotate(np.asarray(point, dtype=np.float64) - np.array([0.0, 0.0, self.height]))
 
     def rotate(self, vector: ArrayLike) -> FloatArray:
-        """Convert velocities or other free vectors (..., 3) between paper frame and world frame.
+        """Convert free vectors (..., 3), such as velocities, between machine's and world frame.
 
         The conversion is the same in both directions.
         """

@@ -57,7 +57,7 @@ _MOMENTS = {f"i{'xyz'[i]}{'xyz'[j]}": (i, j) for i in range(3) for j in range(i,
 def urdf_text(mechanism: Mechanism, closure_frames: bool = False) -> str:
     """Write the spanning tree as URDF, in the machine's frame.
 
-    If ``closure_frames``, add two frames for each closure, which :func:`loops_text` names.
+    If ``closure_frames`` is true, add two frames for each closure; :func:`loops_text` names them.
     """
     root = Element("robot", name=mechanism.name)
     root.append(Comment(" Generated from tpm_gym.mechanism; do not edit (make urdf). "))

@@ -39,8 +39,8 @@ def torque(
         free_fall: Acceleration of gravity in the machine's frame, m/s^2.
         link_masses: For each moving link, factor by which its mass and inertia are multiplied.
         theta: Positions of the motors (3,), rad or m.
-        theta_dot: Velocities of the motors (3,), per s.
-        theta_ddot: Accelerations of the motors (3,), per s^2.
+        theta_dot: Velocities of the motors (3,), rad/s or m/s.
+        theta_ddot: Accelerations of the motors (3,), rad/s^2 or m/s^2.
     """
 
     def frames(motors: FloatArray) -> FloatArray:

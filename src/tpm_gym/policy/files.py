@@ -160,7 +160,10 @@ class Description(_Entries):
 
 
 def files(path: str | Path) -> tuple[Path, Path]:
-    """Return the JSON file and the file of weights; ``path`` is either, or their common name."""
+    """Return the paths of the JSON file and the file of weights of a policy.
+
+    ``path`` is one of the two paths, or their common part without the suffix.
+    """
     if not isinstance(path, str | Path) or not str(path):
         raise InputError("path", path, "the str or Path of a policy, as in 'runs/reach/best.json'")
     path = Path(path)
@@ -176,7 +179,10 @@ def files(path: str | Path) -> tuple[Path, Path]:
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256, in hex, of a policy's JSON without ``sha256``; order does not count."""
+    """Return the SHA-256, in hex, of a policy's JSON without the entry ``sha256``.
+
+    The order of the entries does not matter.
+    """
     entries = {name: value for name, value in content.items() if name != "sha256"}
     text = json.dumps(entries, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode("ascii")).hexdigest()

@@ -32,12 +32,12 @@ _MINUS_Y, _PLUS_Z, _ORIGIN = (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
 
 
 class Inertia(NamedTuple):
-    """Constants of the dynamics; see :mod:`tpm_gym.mechanism.inertia` for b, ``fixed``, ``spin``.
+    """Constants of the dynamics; a, b, ``fixed``, ``spin``: see :mod:`tpm_gym.mechanism.inertia`.
 
     Attributes:
-        motors: For each leg, moment of inertia of the arm and of the rods' near ends about the
-            motor's axis, kg m^2.
-        weights: For each leg, mass at B_i minus ``couples``, kg.
+        motors: For each leg, moment of inertia about the motor's axis, kg m^2. It is the sum for
+            the arm and for masses at B_i: the crosses, and the constants a of the rods.
+        weights: For each leg, mass at B_i minus the leg's entry of ``couples``, kg.
         couples: For each leg, sum of the constants b of its two rods B_iC_i, kg.
         platform: Mass at P, kg.
         fixed: For each leg, moment of inertia of its crosses about the axis of their swing, kg m^2.

@@ -10,8 +10,8 @@ The model of the masses is exact for the bodies of :mod:`tpm_gym.mechanism.delta
 * crosses swing with their rods;
 * platform, cup and payload translate as P does. The cup's slide is assumed to be at rest.
 
-Forces of inertia and weight act at B_i and P. Three linear equations, with the rods as columns,
-give the forces in the rods. The forces in the rods give the torques.
+Forces of inertia and weight act at B_i and P. The forces in the rods solve three linear equations;
+the columns of their matrix are the vectors B_iC_i. The forces in the rods give the torques.
 
 Units are SI. In the base's frame, gravity points along +z, as the base hangs upside down.
 """
@@ -97,7 +97,7 @@ def torques(pose: Pose, rates: Triple, changes: Triple, gravity: Triple, m: Iner
 
 
 def gather(pose: Pose, force: Triple) -> Triple:
-    """Compute the torques that balance a force (N) at P, J^T force."""
+    """Compute J^T force, the torques (N m) with which the motors exert ``force`` (N) at P."""
     one, two, three = pose.bars
     p, q, r = pose.serial
     return (

@@ -47,7 +47,7 @@ class BothSides(TPM):
         return left
 
     def same_side(self, position: ArrayLike) -> BoolArray:
-        """See :class:`Machine`; both sides belong to the machine."""
+        """See :class:`Machine`; the result is true for all points, on both sides of y = 0."""
         return np.ones(np.shape(position)[:-1], dtype=np.bool_)
 
     def conditioning_at(self, position: ArrayLike) -> FloatArray:

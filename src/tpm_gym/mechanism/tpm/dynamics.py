@@ -12,8 +12,8 @@ torques of the motors (:func:`gather`). Sixteen constants describe the bodies
 * the arms turn about the motors' axes;
 * a rod is a bar between B_i and C_i, with the kinetic energy of two coupled points. Rods 4 and 11
   also turn about their own axes as they swing. Some bodies swing with rods: end link 9 with rods
-  11, and the crosses (the middle pieces of the universal joints at arm 2) with rods 4. The turning
-  of the rods and these bodies have constants of their own, see ``Swing`` in
+  11, and the crosses (the middle pieces of the universal joints at arm 2) with rods 4. Separate
+  constants describe this turning of the rods and the swing of these bodies; see ``Swing`` in
   :mod:`tpm_gym.mechanism.inertia`;
 * link 3' translates in the plane y = 0, as C1 does;
 * link 7 turns about z. It is a bar between C1 and P, except for constant offsets;

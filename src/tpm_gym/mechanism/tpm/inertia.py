@@ -15,12 +15,13 @@ from tpm_gym.mechanism.inertia import Bodies, Swing, X, Y, Z, three
 class Inertia(NamedTuple):
     """Constants of the dynamics.
 
-    The coupling constant of a bar (b in :mod:`tpm_gym.mechanism.inertia`) is the mass that couples
-    the velocities of the bar's two ends in its kinetic energy.
+    The constants a and b of a bar are defined in :mod:`tpm_gym.mechanism.inertia`. b is called the
+    coupling constant: it couples the velocities of the bar's two ends in the kinetic energy.
 
     Attributes:
-        motors: For each leg, moment of inertia of the arm and of the rods' near ends about the
-            motor's axis, kg m^2.
+        motors: For each leg, moment of inertia about the motor's axis, kg m^2. It is the sum for
+            the arm and for masses at B_i: the constants a of the rods, and the masses of the
+            crosses (leg 1) or of end link 9 (leg 3).
         weights: For each leg, mass at B_i minus the leg's entry of ``couples``, kg.
         couples: For each leg, sum of the coupling constants of its rods B_iC_i, kg.
         link3: Mass at C1, kg.

@@ -406,8 +406,9 @@ def _clip_face(
 ) -> int:
     """Add contacts at the corners of the overlap of two faces that face each other.
 
-    One face belongs to ``plane``; its normal is axis ``face`` of ``plane``. The other face belongs
-    to ``other``. ``sign`` is 1 if ``plane`` is body a of the pair, and -1 if it is body b.
+    One face belongs to the box ``plane`` and is normal to axis ``face`` of this box. The other face
+    belongs to the box ``other``. ``sign`` is 1 if ``plane`` is body a of the pair, and -1 if
+    ``plane`` is body b.
     """
     away, facing = plus(other.middle, plane.middle, -1.0), 0
     normal = plus(_ZERO, plane.frame[face], math.copysign(1.0, dot(plane.frame[face], away)))

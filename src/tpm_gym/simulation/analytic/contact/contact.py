@@ -118,10 +118,11 @@ class Contact:
             last: Number of time steps, at the end of ``route``, for which forces are returned.
 
         Returns:
-            Force (r, last, 3) N of cup and objects on the platform in each time step, machine's
-            frame. It includes the inertia of the cup's motion relative to P. It does not include
-            the cup's weight, nor the inertia of a cup that moves as P does, because the machine's
-            dynamics include both. Mass (r,) kg of the held objects.
+            Two arrays: force (r, last, 3) N of cup and objects on the platform in each of the
+            ``last`` time steps, machine's frame; and mass (r,) kg of the held objects. The force
+            includes the inertia of the cup's motion relative to P. It does not include the cup's
+            weight, nor the inertia of a cup that moves as P does, because the machine's dynamics
+            include both.
         """
         force, carried = np.zeros((len(rows), last, 3)), np.zeros(len(rows))
         if self._blocks:
