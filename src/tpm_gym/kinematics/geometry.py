@@ -15,7 +15,7 @@ can nearly coincide, and their intersections would be inaccurate."""
 
 
 class Lengths(NamedTuple):
-    """Lengths l1 to l7, m, as any kind of numbers, such as tensors, without checks."""
+    """Lengths l1 to l7, m. They may be numbers of any kind, such as tensors; nothing is checked."""
 
     l1: Numbers
     l2: Numbers

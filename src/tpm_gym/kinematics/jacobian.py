@@ -129,7 +129,10 @@ def link_velocity(
 def conditioning(
     theta: ArrayLike, branch: AssemblyMode = DEFAULT_ASSEMBLY, geometry: Geometry = PAPER
 ) -> FloatArray:
-    """Compute 1/cond(J), (...,): 0 at a singularity (up to rounding), 1 where J is isotropic."""
+    """Compute 1/cond(J), an array (...,).
+
+    The result is 0 at a singularity (up to rounding) and 1 where J is isotropic.
+    """
     return _from_angles(lambda c: [_conditioning(c)], theta, branch, geometry)[0]
 
 
@@ -139,9 +142,9 @@ def conditioning_at(
     assembly: AssemblyMode = DEFAULT_ASSEMBLY,
     geometry: AnyLengths = PAPER,
 ) -> FloatArray:
-    """Compute 1/cond(J) at points, (...,).
+    """Compute 1/cond(J) at points, an array (...,).
 
-    The result is 0 unless a point is reachable in the working mode ``branch`` and in the assembly
+    The result is 0 at points that are not reachable in the working mode ``branch`` and the assembly
     mode ``assembly``.
 
     To differentiate by the lengths, pass points as a tensor and the lengths as tensors in a

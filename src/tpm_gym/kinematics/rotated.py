@@ -235,7 +235,10 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
         return rho2, _dot(kappa, n), q
 
     def closures(rho: FloatArray, tilt: FloatArray) -> tuple[_Pair, _Four]:
-        """Return the closures of rods 4 and rod 6, m^2, and their derivatives by rho and tilt."""
+        """Return two closures |rod|^2 - l4^2, m^2, and their derivatives by rho and tilt.
+
+        Rods 4a and 4b have the first closure, rod 6 has the second closure.
+        """
         n, u = np.exp(-0.5j * tilt), np.exp(-1j * tilt)
         rod6 = rho * n - 2 * g.l5 * (u - 1) - kappa
         gaps = rho**2 + (2 * g.l5 * n.imag) ** 2 - reach2, abs(rod6) ** 2 - g.l4**2
@@ -385,11 +388,12 @@ def factors(postures: RotatedPostures) -> Factors:
 
 @np.errstate(all="ignore")
 def velocity(postures: RotatedPostures) -> FloatArray:
-    """Compute rates of P (m/rad) and the tilt (rad/rad) for unit rates of the motors, (..., 4, 3).
+    """Compute the derivatives of P and of the tilt by the joint positions, (..., 4, 3).
 
-    The rates keep the lengths of all rods. Rods 4a, 4b and 6 give the velocity and the turn of link
-    3', and rods 11a and 11b give the rate of link 7. At a parallel singularity, and where the two
-    operation modes meet, the rates are not finite.
+    The first three rows belong to P (m/rad), the last row belongs to the tilt (rad/rad), and the
+    columns belong to the motors. The lengths of the rods are constant: rods 4a, 4b and 6 determine
+    the motion of link 3', and rods 11a and 11b determine the turn of link 7. At a parallel
+    singularity, and where the two operation modes meet, the derivatives are not finite.
     """
     g, rods, ends = postures.geometry, postures.rods, postures.ends
     rates = _elbow_rates(postures.theta, g)[..., [0, 0, 1, 2], :]

@@ -38,7 +38,7 @@ class Region:
     high: Vector
 
     def __post_init__(self) -> None:
-        """Reject empty boxes; arrays become tuples."""
+        """Reject empty boxes; convert ``low`` and ``high`` to tuples."""
         for name in ("low", "high"):
             object.__setattr__(self, name, vector(name, getattr(self, name), ConfigurationError))
         if not all(low <= high for low, high in zip(self.low, self.high, strict=True)):

@@ -4,7 +4,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command line, or name the missing package."""
+    """Run the command line; if a required package is missing, print its name and exit."""
     try:
         from tpm_gym.learning import command_line
 

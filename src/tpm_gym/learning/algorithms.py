@@ -110,7 +110,10 @@ class Algorithm:
         return None
 
     def hyperparameters(self) -> set[str]:
-        """Return the constructor's arguments that a recipe can have; models have them, too."""
+        """Return the names of the constructor's arguments that a recipe can have.
+
+        A model stores these arguments in attributes of the same names.
+        """
         return _ENTRIES.keys() & inspect.signature(self.load_class()).parameters.keys()
 
     def entries(self) -> Any:

@@ -107,7 +107,11 @@ def quality(evaluation: Mapping[str, Any]) -> tuple[float, float]:
 
 @dataclass(eq=False)
 class Progress(BaseCallback):
-    """Callback that calls ``advance`` with the number of new steps after each step."""
+    """Callback that reports the progress of a training.
+
+    Whenever the environments have taken a step, ``advance`` is called with the number of steps
+    since the previous call, summed over all environments.
+    """
 
     advance: Callable[[int], object]
 

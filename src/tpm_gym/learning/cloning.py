@@ -30,7 +30,7 @@ def clone(
     """Fit a policy's mean action, and its value function, to n recorded steps.
 
     Args:
-        model: Algorithm with a policy of Stable-Baselines3's ``ActorCriticPolicy``.
+        model: Algorithm whose policy is an ``ActorCriticPolicy`` of Stable-Baselines3.
         observations: Arrays (n, ...) by name.
         actions: (n, action_size), the actions to imitate.
         returns: (n,), discounted sums of the rewards that followed.

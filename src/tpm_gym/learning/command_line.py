@@ -41,7 +41,8 @@ class ExportConfig:
     """Load a .zip file, which can run any code."""
 
     env: Annotated[str, unset(str, "the run's", "ID")] = UNSET
-    """Environment id of the training, or module:id. A .zip outside the folder of a run needs it."""
+    """Environment id of the training, or module:id. This option is required for a .zip outside the
+    folder of a run."""
 
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 

@@ -65,7 +65,10 @@ def parse_randomisation(words: Sequence[str]) -> dict[str, Any]:
 
 
 def parse_shield(words: Sequence[str]) -> bool | float:
-    """Parse the words after ``--shield``: True, False or a conditioning; no word means True."""
+    """Parse the words after ``--shield``: True, False or a conditioning.
+
+    If there are no words, the result is True.
+    """
     text = " ".join(words) or "True"
     return text == "True" if text in ("True", "False") else float(text)
 
@@ -82,7 +85,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment. Default "the id's": the environment id decides."""
+    """Options of an environment. The default "the id's" is the value set by the environment id."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""
@@ -136,7 +139,8 @@ class TrainingConfig:
     algo: Annotated[
         str, unset(str, "one that has a recipe for <env>", "{" + ",".join(ALGORITHMS) + "}")
     ] = UNSET
-    """Algorithm: sac and tqc for sparse rewards, ppo for a Dense id."""
+    """Algorithm: sac or tqc for sparse rewards; ppo for dense rewards (ids that contain Dense), or
+    for sparse rewards with demonstrations."""
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReach-v0"
     """Environment id, or module:id if a module of yours registers it."""
@@ -184,8 +188,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of the best policy's test in the analytic engine, and of its test in PyBullet, after
-    a training in --engine analytic; 0 for no test."""
+    """Episodes of each final test; 0 for no test. Only a training with --engine analytic has final
+    tests: the best policy is tested in the analytic engine and in PyBullet."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so

@@ -1,8 +1,9 @@
 """Datasets for offline learning, in the format of Minari.
 
-The episodes of ``expert``, ``noisy`` and ``random`` depend on their seeds alone. Repeating a
+Episodes of the kinds ``expert``, ``noisy`` and ``random`` depend only on their seeds. Repeating a
 command therefore gives a bit-equal dataset, and a longer dataset begins with the episodes of a
-shorter one. ``replay`` depends on the training, too; see :mod:`tpm_gym.learning.replay`.
+shorter one. Episodes of the kind ``replay`` also depend on the training; see
+:mod:`tpm_gym.learning.replay`.
 """
 
 from __future__ import annotations
@@ -214,9 +215,9 @@ def _complete(config: CollectConfig) -> list[str]:
 
 
 def _stored(env: str, options: EnvOptions) -> EnvSpec:
-    """Return the registration that a dataset stores: the id's, with the options of the command.
+    """Return the registration of ``env``, changed by ``options``, as a dataset stores it.
 
-    A machine and a task are stored by the names under which they are registered, if they are.
+    A machine or a task that is registered is stored by its name.
     """
     spec = copy.deepcopy(check_env_id(env))
     spec.kwargs |= options.given()
@@ -230,7 +231,10 @@ def _stored(env: str, options: EnvOptions) -> EnvSpec:
 
 
 def _require_recoverable(env: str, options: EnvOptions) -> None:
-    """Refuse an environment that could not be made from the dataset, or would be another one."""
+    """Refuse an environment that could not be made again from a dataset.
+
+    The environment that is made again must have the same task and the same options.
+    """
     spec = _stored(env, options)
     for name, value in spec.kwargs.items():
         try:
@@ -255,7 +259,7 @@ def _require_recoverable(env: str, options: EnvOptions) -> None:
 
 
 def _require_possible(env: str, options: EnvOptions) -> None:
-    """Refuse options that an environment refuses, before datasets of others are written."""
+    """Refuse options that the environment refuses, before any dataset is written."""
     try:
         _kind(_stored(env, options))
     except ConfigurationError as error:

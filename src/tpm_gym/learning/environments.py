@@ -25,7 +25,7 @@ USUAL: Final[Mapping[str, Any]] = {
     "drive": "ideal",
     "shield": False,
 }
-"""Conditions of an id whose registration does not set them."""
+"""Machine, engine, drive and shield of an id whose registration does not set them."""
 
 
 def import_module_of(env_id: str) -> None:
@@ -101,10 +101,10 @@ def set_by(env_id: str) -> dict[str, Any] | None:
 
 
 def named(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return machine, engine, drive and shield of some options, as plain data for files.
+    """Return machine, engine, drive and shield of ``options``, as plain data for files.
 
-    A machine is named. If another machine is registered under its name, the name gets a suffix, so
-    that the name never stands for the wrong machine.
+    A machine is written as its name. If a different machine is registered under this name, a suffix
+    is appended, so that the name never stands for the wrong machine.
     """
     found = {name: options[name] for name in USUAL if name in options}
     if isinstance(machine := found.get("machine"), Machine):
@@ -118,7 +118,7 @@ def named(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _printable(text: str) -> str:
-    """Return a text as policy files take it: at most 100 printable characters of ASCII."""
+    """Convert a text to at most 100 printable characters of ASCII, for policy files."""
     return text.encode("unicode_escape").decode()[:100]
 
 

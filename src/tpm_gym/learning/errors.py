@@ -28,4 +28,4 @@ class RolloutError(LearningError):
 
 
 class DivergedError(LearningError, ArithmeticError):
-    """Training whose networks are no longer finite."""
+    """Training in which weights of the networks became infinite or NaN."""

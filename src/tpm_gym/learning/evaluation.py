@@ -200,7 +200,7 @@ def _complete(config: EvaluationConfig) -> EvaluationConfig:
 
 
 def _common(option: str, values: Mapping[str, Any]) -> Any:
-    """Return the value of an option that all policies share; refuse different values."""
+    """Return the value of an option; raise ConfigError if the policies have different values."""
     found = set(values.values())
     if len(found) > 1:
         each = ", ".join(f"{value} ({spec})" for spec, value in values.items())
@@ -219,7 +219,10 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _shown(config: EvaluationConfig) -> dict[str, str]:
-    """Return the conditions for table and JSON; ``shield`` is among them only if there is one."""
+    """Return machine, engine, drive and shield as texts, for the table and the JSON file.
+
+    The shield is left out if it is off.
+    """
     found = _conditions(config.env, config.env_options.given())
     return {name: str(value) for name, value in found.items() if value is not False}
 
@@ -247,7 +250,7 @@ def _evaluate_one(
 
 
 def _say_without_bar(console: Console, text: str) -> None:
-    """Say what takes a while where no progress bar is shown."""
+    """Print ``text``, the description of a slow task, if the console shows no progress bar."""
     if not console.is_terminal:
         console.print(f"{text} ...", markup=False, soft_wrap=True)
 

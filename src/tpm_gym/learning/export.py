@@ -72,14 +72,14 @@ def save_policy(
 ) -> Path:
     """Write the policy of a model as safetensors and JSON; return the path of the JSON file.
 
-    :func:`tpm_gym.load_policy` and ``tpm-gym evaluate --policy`` read these files. The model may
-    come from Stable-Baselines3 alone. The spaces of the environment are compared with the model's.
+    :func:`tpm_gym.load_policy` and ``tpm-gym evaluate --policy`` read these files. The model can
+    come from ``tpm-gym train`` or from a program of your own that uses Stable-Baselines3.
 
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Path of the files without their endings. An earlier policy is replaced.
         env_id: Id of the environment of the training.
-        env_options: Machine, engine, drive and shield of the training, where they are not the
+        env_options: Machine, engine, drive and shield of the training, if they differ from the
             defaults of ``env_id``.
 
     Raises:
@@ -119,8 +119,8 @@ def save(
     Args:
         model: SAC, TQC or PPO with a MultiInputPolicy.
         path: Path of the files without their endings. An earlier policy is replaced.
-        env_options: Machine, engine, drive and shield of the training. Options that are left out
-            are those of ``env_id``, which are written too if its registration sets them.
+        env_options: Machine, engine, drive and shield of the training. For options that are left
+            out, the values that the registration of ``env_id`` sets are written.
         versions: Versions at training; by default the installed ones.
 
     Raises:
@@ -208,9 +208,10 @@ def convert(
         archive: Model (.zip), exported policy (.json), or folder of a run (its best policy).
         path: Path of the new files without their endings.
         trust_pickle: Whether a .zip may be loaded, which can run any code.
-        env_id: Environment of the training, for a model outside the folder of a run.
-        env_options: Its machine, engine, drive and shield.
-        evaluation: Results for a model card, which are checked before anything is written.
+        env_id: Environment id of the training, required for a .zip outside the folder of a run. For
+            other archives, ``env_id`` and ``env_options`` are refused.
+        env_options: Machine, engine, drive and shield of the training.
+        evaluation: File with results for a model card. It is checked before anything is written.
     """
     if archive.is_dir():
         found = [file for file in exported_in(archive) if file.is_file()]

@@ -122,10 +122,11 @@ def load_policy(spec: str, envs: TPMVectorEnv) -> Policy:
 
 
 def trained_in(spec: str) -> tuple[str, dict[str, Any]] | None:
-    """Return environment id and conditions of a policy's training; None for expert and random.
+    """Return the environment id and the options of a policy's training.
 
-    A condition that the file does not hold is that of the environment id. It is left out if the id
-    is not registered.
+    The options are machine, engine, drive and shield. If the policy's file lacks an option, the
+    default of the environment id is returned; if the id is not registered, the option is left out.
+    The result is None for ``expert`` and ``random``, which are not trained.
     """
     if spec in SCRIPTED:
         return None

@@ -35,7 +35,10 @@ def origin() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of Python and the packages; None for a package that is not installed."""
+    """Return the versions of Python, of tpm_gym and of the main packages that tpm_gym uses.
+
+    The version of a package that is not installed is None.
+    """
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}
 
 

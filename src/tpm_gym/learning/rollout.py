@@ -234,9 +234,9 @@ _WORST: Final[Mapping[str, Any]] = {
 def summarise(records: Sequence[Episode]) -> dict[str, Estimate]:
     """Return the metrics of an evaluation by name, each with its 95% interval over episodes.
 
-    Success rates and shares of episodes with an event have Wilson intervals, which are valid at 0
-    and 1 too. Other metrics have percentile bootstrap intervals. The lowest conditioning, the
-    largest errors and the torques also have the value of the worst episode.
+    Success rates and shares of episodes with an event have Wilson intervals, which are also valid
+    for rates and shares of 0 and 1. Other metrics have percentile bootstrap intervals. The lowest
+    conditioning, the largest errors and the torques also have the value of the worst episode.
     """
     rows = [record.as_dict() for record in records]
     found = {}

@@ -413,7 +413,11 @@ def training_envs_of(config: TrainingConfig) -> Iterator[VecEnv]:
 
 
 def make_training_envs(config: TrainingConfig) -> VecEnv:
-    """Build the training environments: in processes, or together in the analytic engine."""
+    """Build the training environments.
+
+    In the analytic engine, all environments are in this process. In another engine, each of several
+    environments has its own process.
+    """
     several = config.envs > 1
     if several and config.env_options.in_batches:
         # Episodes that end at different steps give an on-policy batch all parts of an episode.

@@ -89,7 +89,7 @@ class TuneConfig:
     env_options: GivenEnvOptions = field(default_factory=EnvOptions)
 
     randomisation: Randomised = ()
-    """Domain randomisation, as in train."""
+    """Domain randomisation, as in the command tpm-gym train."""
 
 
 def tune(config: TuneConfig) -> Path:
