@@ -223,7 +223,7 @@ def shares_no_memory(make: Make) -> None:
 
 
 def computes_rewards_of_batches(make: Make) -> None:
-    """Check compute_reward for the goals of an episode, and for goals that it has achieved."""
+    """Check compute_reward for the desired goals and for the achieved goals of an episode."""
     with closing(make()) as env:
         steps = list(random_episode(env, 8))[1:]
         inner: Any = env.unwrapped
