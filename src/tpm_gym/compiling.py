@@ -169,9 +169,9 @@ def stamp(function: Callable[..., Any]) -> str:
 
 
 def _parts(value: Any, seen: dict[Any, int]) -> Iterator[str]:
-    """Yield text about a value.
+    """Yield the texts about a value that :func:`stamp` hashes.
 
-    The text is equal in all processes in which code and constants are equal. The order counts,
+    The texts are equal in all processes in which code and constants are equal. Their order matters,
     because the same parts in another order make another function.
     """
     value = getattr(value, "py_func", value)

@@ -117,7 +117,7 @@ def reachable_set(
         limits: For example :func:`~tpm_gym.analysis.limits.within_stops`.
 
     Raises:
-        ConfigurationError: The shape is not possible.
+        ConfigurationError: ``shape`` is not three such numbers.
     """
     low, spacing, codes = _codes(branch, geometry, shape, limits)
     return Cells(low, spacing, codes >= 0)
@@ -138,7 +138,8 @@ def aspects(
     of fewer than ``min_cells`` cells are left out: they are fragments along curved boundaries.
 
     Raises:
-        ConfigurationError: The shape is not possible, or min_cells is not positive.
+        ConfigurationError: ``shape`` is not valid for :func:`reachable_set`, or ``min_cells`` is
+            not a positive whole number.
     """
     low, spacing, codes = _codes(branch, geometry, shape, limits)
     found = []
@@ -232,7 +233,7 @@ def largest_box(aspect: Aspect, threshold: float) -> Box:
 
 
 def require_shape(shape: object, least: int) -> None:
-    """Raise ConfigurationError if the numbers of cells along x, y, z are not possible."""
+    """Raise ConfigurationError unless ``shape`` is three whole numbers of at least ``least``."""
     counts = list(shape) if isinstance(shape, (tuple, list, np.ndarray)) else []
     if len(counts) != 3 or not all(is_whole(count, least) for count in counts):
         raise ConfigurationError("shape", shape, f"three whole numbers from {least} up")

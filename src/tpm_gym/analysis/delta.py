@@ -105,8 +105,9 @@ def aspects(
         min_cells: Fewest cells of an aspect.
 
     Raises:
-        ConfigurationError: The shape is not possible, or min_cells is not positive.
-        InputError: bends or geometry are not of a Delta.
+        ConfigurationError: ``shape`` is not three whole numbers of at least 2, or ``min_cells`` is
+            not a positive whole number.
+        InputError: ``bends`` is not three signs, each 1 or -1, or ``geometry`` is no DeltaGeometry.
     """
     grid = _codes(bends, geometry, shape, within_stops)
     return tuple(

@@ -177,7 +177,7 @@ class Chain:
 
     @property
     def freedoms(self) -> int:
-        """Sum of the degrees of freedom f_i."""
+        """Sum of the degrees of freedom f_i of the units."""
         return sum(unit.freedoms for unit in self.units)
 
     @property
@@ -213,7 +213,8 @@ def parallel(sets: Sequence[POCSet]) -> POCSet:
 def coupling_degrees(decompositions: Sequence[Sequence[int]]) -> tuple[float, ...]:
     """Return the coupling degree kappa of each Assur kinematic chain (AKC), Eq. (5).
 
-    An AKC ends where its constraint degrees add up to zero.
+    An AKC is a series of successive loops. It ends with the first loop at which the constraint
+    degrees of its loops add up to zero; the next loop begins another AKC.
 
     Args:
         decompositions: Constraint degrees Delta_j of the loops, for each decomposition. The
@@ -241,7 +242,7 @@ class Loop:
 
     Attributes:
         chains: Names of the chains that form the SOC.
-        freedoms: Sum of f_i over the SOC.
+        freedoms: Sum of the degrees of freedom f_i of the units in the SOC.
         actuated: Number of motors, I_j.
         equations: Number of independent equations, xi_Lj.
     """

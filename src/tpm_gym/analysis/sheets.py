@@ -112,7 +112,10 @@ def _elevation(
 
 
 def _real(g: Geometry, factor: str, first: int, t: FloatArray) -> FloatArray:
-    """Return values that are positive where a branch of a curve is real at the angle t."""
+    """Return a number for each angle ``t``, positive where the curve of a factor is real.
+
+    ``first`` is the first of the two signs that select a branch of the curve; see :data:`Curve`.
+    """
     if factor == "leg1":
         return (g.l3 + g.l4 * np.cos(t)) ** 2 - g.l1**2
     if factor == "elevation":
@@ -325,9 +328,9 @@ def _feet(
     def on(cells: IntArray, t: FloatArray) -> tuple[Point, tuple[FloatArray, ...], BoolArray]:
         """Return points on k arcs, and the results of offset() and belongs() for these points.
 
-        Entry i of ``row``, ``arc`` and ``cell`` is one search: for the nearest point to the point
-        ``row[i]``, in cell ``cell[i]`` of arc ``arc[i]``. ``cells`` (k,) are indices i of searches.
-        ``t`` (k, ...) is as in :meth:`_Arcs.at`.
+        Search i looks in cell ``cell[i]`` of arc ``arc[i]`` for the point nearest to
+        ``points[row[i]]``. ``cells`` (k,) are the numbers i of k searches. ``t`` (k, ...) are
+        places on the arcs of these searches, as in :meth:`_Arcs.at`.
         """
         point, rows = arcs.at(arc[cells], t), link3[row[cells]]
         found = offset(rows[:, None] if t.ndim > 1 else rows, *point[:2])

@@ -91,7 +91,7 @@ class NearestSingularity:
 def dimensionless(values: Factors, geometry: Geometry = PAPER) -> FloatArray:
     """Divide the factors (..., 8) by lengths, so that one tolerance suits all factors.
 
-    level3 and elevation are divided by l4, planar by l4^2, and the legs by l3 l4.
+    level3 and elevation are divided by l4, planar by l4^2, and leg1, leg2 and leg3 by l3 l4.
     """
     l3, l4 = geometry.l3, geometry.l4
     return np.stack(values, axis=-1) / [1.0, l4, l4**2, 1.0, l3 * l4, l3 * l4, l3 * l4, l4]
@@ -103,10 +103,10 @@ def classify(
     geometry: Geometry = PAPER,
     tolerance: float = 1e-6,
 ) -> Classification:
-    """Classify joint angles theta (..., 3) rad (section "Singularity analysis").
+    """Classify joint positions theta (..., 3) rad (the paper's section "Singularity analysis").
 
     A dimensionless factor counts as zero up to ``tolerance``. Use 1e-7 or more: where two branches
-    merge, a factor computed from joint angles has an error of about the square root of the
+    merge, a factor computed from joint positions has an error of about the square root of the
     rounding error.
     """
     return _classify(factors(numbers("theta", theta), branch, geometry), geometry, tolerance)

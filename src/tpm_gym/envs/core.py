@@ -418,7 +418,8 @@ class Core:
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes for :func:`copy.deepcopy` and :mod:`pickle`, during episodes too.
 
-        A snapshot of the simulation replaces the simulation; it is None if no episode is running.
+        In the result, ``simulation`` is a snapshot of the simulation, or None if no episode is
+        running.
 
         Raises:
             ConfigurationError: If there is a window: PyBullet opens only one in a process.

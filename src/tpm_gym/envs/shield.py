@@ -3,9 +3,9 @@
 Let c be the last command, b the middle between c and the command before c, and d the next command.
 In a control period, point P follows the Bezier curve with the control points b, c and (c + d) / 2.
 If the command then stays at d, P moves on to d in a straight line. The command d is safe if the
-conditioning 1/cond(J) stays at ``least`` or above on this curve and this line. So it is always safe
-to hold the last command c: P then moves on the line from b to c, and the check of c included this
-line.
+conditioning 1/cond(J) does not fall below the limit ``Shield.least`` on this curve and this line.
+So it is always safe to hold the last command c: P then moves on the line from b to c, and the check
+of c included this line.
 
 Sequential quadratic programming finds the nearest safe command, as docs/shield.md explains. If all
 searches fail, the command is moved towards the last command.
@@ -34,10 +34,11 @@ MARGIN = 0.15
 """Extra conditioning that shields keep with servo drives or randomised plants, as a fraction of the
 machine's ``safe_conditioning``."""
 TOLERANCE = 2e-5
-"""Amount by which the conditioning at commands should exceed ``least``.
+"""Amount by which the conditioning at commands should exceed ``Shield.least``.
 
-The check of a path requires half of this amount. It is a reserve for errors of the check, which
-computes the conditioning at seven points of the path and interpolates between them.
+A path passes the check if its smallest conditioning exceeds ``Shield.least`` by half of this amount
+or more. This half is a reserve for errors of the check, which computes the conditioning at seven
+points of the path and interpolates between them.
 """
 _FAR = 1.05
 """If the conditioning at three successive commands is at least this multiple of ``Shield.least``,
@@ -81,10 +82,10 @@ class Problem(NamedTuple):
 class Shield:
     """Shield that replaces unsafe commands by the nearest safe ones, for n robots.
 
-    Distances between commands are Euclidean, in units of the action: increments of P with Cartesian
-    control, increments of the joints with joint control. The wanted command is the command that the
-    control computes from the action. The returned command is at most 0.003 of these units farther
-    from the wanted command than the nearest safe command is.
+    Distances between commands are Euclidean, in units of the action: one unit is the largest
+    increment of P along an axis (Cartesian control) or of a joint (joint control). The wanted
+    command is the command that the control computes from the action. The returned command is at
+    most 0.003 units farther from the wanted command than the nearest safe command is.
 
     Args:
         machine: Nominal machine.
@@ -200,7 +201,7 @@ class BrakingShield:
 
     Args:
         machine: Nominal machine.
-        follower: Limit of commands to motions that the motors can follow.
+        follower: Limiter of commands, so that the motors can follow them.
         least: Smallest conditioning on the path of the commands.
     """
 
@@ -263,7 +264,7 @@ def make_shield(
     Args:
         shield: The conditioning to keep, or True for the machine's ``safe_conditioning``.
         machine: Nominal machine.
-        follower: Limit of the control's commands, if their accelerations are bounded.
+        follower: Limiter of the control's commands; None if their accelerations are not bounded.
         exact: Whether the robot follows its commands exactly. If it does not, the conditioning to
             keep with ``shield=True`` is (1 + :data:`MARGIN`) times ``safe_conditioning``.
 
@@ -332,12 +333,13 @@ def solved(
 ) -> tuple[FloatArray, FloatArray]:
     """Solve problems with linearised conditioning, by Hildreth's method.
 
-    The constraints are treated in turn. If a constraint is violated, the point is pushed until the
-    constraint holds with equality. If a constraint holds with a reserve, the point is moved back,
-    but not farther than this constraint has pushed it in total.
+    The search begins at the wanted command, and treats the constraints in turn. A constraint that
+    is violated pushes the solution found so far until the constraint holds with equality. If a
+    constraint holds with a reserve, the solution is moved back, but not farther than this
+    constraint has pushed it in total.
 
     Args:
-        point: (r, 3) m, where the conditioning is linearised.
+        point: (r, 3) m, points at which the conditioning is linearised.
         here: (r, 3), ``point`` in units of the action.
         rate: (r, 3, 3) m, motion of P for unit actions.
         slope: (r, 3) 1/m, gradient of the conditioning.

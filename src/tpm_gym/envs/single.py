@@ -79,9 +79,9 @@ class TPMEnv(gym.Env[Observation, Action]):
     follows the commands along a B-spline. In the world frame, the task region of P is
     -0.24 <= x <= 0.12, -0.046 <= y <= -0.012, 0.067 <= z <= 0.31 m. Along each axis, joint
     increments move P no farther than the largest Cartesian increment. Small turns of the joints
-    move P far along y. Therefore the limit along y scales most random joint actions down to a
-    tenth, with one factor for all three joints. Cycle has control steps of 4 ms, smaller increments
-    and bounded accelerations.
+    move P far along y. Therefore the limit along y shortens random joint increments to about a
+    tenth of their length (median), with one factor for all three joints. Cycle has control steps
+    of 4 ms, smaller increments and bounded accelerations.
 
     ## Observation
 
@@ -114,7 +114,8 @@ class TPMEnv(gym.Env[Observation, Action]):
     The sum of the terms ``goal`` and ``singularity``. Cycle adds ``gate``, to sparse and dense
     rewards. Tasks with objects add ``approach``, to dense rewards only. In Stack, the distance is
     that of the block farther from its goal, and the cup approaches the upper block. In the step
-    that passes a singularity, the term ``singularity`` is -penalty_weight.
+    that passes a singularity, the term ``singularity`` is -penalty_weight, except at y = 0 in
+    Crossing.
 
     | term | value |
     | --- | --- |
@@ -147,21 +148,24 @@ class TPMEnv(gym.Env[Observation, Action]):
     | ``singularity_penalty`` | penalty before weighting, 0 to 1 |
     | ``assembly_mode_changed`` | whether the platform passed y = 0, a parallel singularity |
     | ``working_mode_changed`` | whether the platform passed y = l7, a serial singularity |
-    | ``object_lost`` | whether an object left the table or the area of starts, reach and goals |
+    | ``object_lost`` | whether an object left the table or its allowed area |
     | ``reward_terms`` | the terms above by name; they sum to the reward |
     | ``randomisation`` | the episode's plant; only from reset(), if this option is set |
 
-    Here y is in the paper's frame, and l7 is the length of link 7. Crossing adds ``crossed``:
-    whether P is on the other side of y = 0 than home. Push adds ``toppled``: whether the block lies
-    on a side.
+    Here y is in the paper's frame, and l7 is the length of link 7. The allowed area of an object is
+    a rectangle that contains its starts, its goals and the places to which the cup can carry it.
+    Crossing adds ``crossed``: whether P is on the other side of y = 0 than home;
+    ``assembly_mode_changed`` does not report this passage. Push adds ``toppled``: whether the block
+    lies on a side.
 
     An environment that is made as ``TPMEnv(...)`` has no time limit; ``gym.make`` adds it.
 
-    Past a parallel singularity the encoders no longer determine the platform's position. Then the
-    penalty is 1 and the episode is truncated, except in Crossing. With the nominal robot and ideal
-    drives, no action leads past a parallel singularity, except in Crossing and in Cycle. In Cycle,
-    adversarial actions at full speed can need more torque than the motors have; ``shield=True``
-    prevents this.
+    Past a parallel singularity the encoders no longer determine the platform's position. Therefore
+    the penalty is then 1, and the episode is truncated. Crossing is an exception: when P passes
+    y = 0, the penalty still depends on the conditioning, and the episode goes on. With the nominal
+    robot and ideal drives, no action leads past a parallel singularity, except in Crossing and in
+    Cycle. In Cycle, adversarial actions at full speed can need more torque than the motors have;
+    ``shield=True`` prevents this.
 
     Args:
         task: Name of a task (``"reach"``, ``"pick_and_place"``, or one that
@@ -297,8 +301,8 @@ class TPMEnv(gym.Env[Observation, Action]):
 
         Args:
             seed: Seeds the environment's rng; equal seeds give equal episodes.
-            options: Start positions of objects (by name) and the ``goal``, m, world frame. Others
-                are sampled.
+            options: Start positions of objects (by name) and the ``goal``, m, world frame. A
+                position or goal that is not given is sampled.
 
         Raises:
             ResetOptionError: If an option is unknown, has the wrong shape, is not finite, or would
@@ -421,11 +425,11 @@ class TPMEnv(gym.Env[Observation, Action]):
         return goal
 
     def save_state(self) -> EnvSnapshot:
-        """Return physics, rng, goal, delayed actions and grasp.
+        """Return a snapshot of physics, rng, goal, delayed actions and grasp.
 
-        Steps from here and steps after :meth:`restore_state` agree in every bit; with two blocks in
-        PyBullet, to rounding. The step count of the wrapper ``TimeLimit`` is not part of the
-        snapshot.
+        Steps from here and steps after :meth:`restore_state` agree in every bit. With two blocks in
+        PyBullet, they agree only up to rounding errors. The step count of the wrapper ``TimeLimit``
+        is not part of the snapshot.
 
         Raises:
             EpisodeError: If no episode is running.

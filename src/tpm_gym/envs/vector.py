@@ -455,7 +455,7 @@ class _Part:
         ``final_info`` of the returned infos.
 
         Args:
-            observation: Observations after the last step; changed.
+            observation: Observations after the last step. The arrays are changed in place.
             last: Infos after the last step.
         """
         core, rows, ended = self.core, np.flatnonzero(self.ended), self.ended.copy()

@@ -77,8 +77,10 @@ class Factors(NamedTuple):
 
     Attributes:
         level3: l1 + l3 cos(theta_3) - xC - 2 l2, m.
-        planar: Cross product, m^2, of B1C1 and B2C2 projected on y = 0; zero where they line up.
-        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad; zero where leg 1 is stretched or folded.
+        planar: Cross product, m^2, of B1C1 and B2C2, both projected on y = 0; zero where the
+            projections are parallel.
+        leg1: B_1C_1 . dB_1/dtheta_1, m^2/rad; zero where leg 1, seen along x, is stretched or
+            folded.
         leg2: B_2C_2 . dB_2/dtheta_2, m^2/rad.
         leg3: B_3C_3 . dB_3/dtheta_3, m^2/rad.
         elevation: z_C1 - z_B1, m. Zero is a constraint singularity: there, the rods of the 4S
