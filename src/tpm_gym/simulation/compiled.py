@@ -108,8 +108,8 @@ def in_world(
         quaternion: (n, k, 4), orientations of the objects, world.
         left: (n,) mode that each robot has left, as the engine reports it: 0 none, 1 assembly, 2
             working.
-        mode_left: (n,) first mode that each robot has left in its episode, same numbers. Entries
-            that are 0 are replaced with those of ``left``.
+        mode_left: (n,) first mode that each robot has left in its episode, coded as in ``left``;
+            changed: an entry that is 0 is replaced with the robot's entry in ``left``.
         gap: (n,) m, largest gap of each robot. If it is above ``limit`` or NaN, a loop is open.
         limit: Largest allowed gap, m.
         turn: (3,) signs (1 or -1). The components of a vector in the machine's frame times these
@@ -177,9 +177,10 @@ def measured(
         most: Largest vacuum, Pa.
 
     Returns:
-        (n, 9 + 12 k): position, velocity, command minus position; then for each object its centre,
-        the vector from the lip to the middle of its top, its velocity, the x and y components of
-        its z axis, and vacuum / most if it is held, else 0.
+        (n, 9 + 12 k): position of P, velocity of P, command minus position; then for each object:
+        its centre, the vector from the lip to the middle of the object's top, the object's
+        velocity, the x and y components of the object's z axis, and vacuum / most if the object is
+        held, else 0.
     """
     values = np.empty((len(position), 9 + 12 * len(halves)))
     for row in range(len(position)):

@@ -134,9 +134,9 @@ class ServoDrives:
     law that uses the joint positions at the beginning of a time step is unstable. So the law uses
     the predicted joint positions at the end of the time step (backward Euler). This law is stable
     at any stiffness. The prediction uses the inertia M and the load. The load is the torque in the
-    last time step minus M times the acceleration in the last time step. The static stiffness equals
-    ``stiffness`` under any load. The damping is larger than ``damping`` by ``stiffness`` x
-    ``time_step``.
+    last time step minus M times the acceleration in the last time step. Under any load, the static
+    stiffness of a drive equals the parameter ``stiffness``. The effective damping is ``damping`` +
+    ``stiffness`` x ``time_step``.
 
     Args:
         servo: Parameters of the servo law.

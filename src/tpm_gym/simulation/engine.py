@@ -68,9 +68,10 @@ class Twist(NamedTuple):
 
 
 class Grip(NamedTuple):
-    """Held object and vacuum, and the pose of the held object; None if no object is held.
+    """Held object and vacuum, and the pose of the held object.
 
-    Each engine chooses the frame of the pose, which moves with the cup.
+    The pose is None if no object is held. Each engine chooses the frame of the pose, which moves
+    with the cup.
     """
 
     hold: Hold = EMPTY

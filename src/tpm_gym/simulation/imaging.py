@@ -144,8 +144,9 @@ class View(NamedTuple):
         camera: Camera, in the world frame.
         width: Width, pixels.
         height: Height, pixels.
-        segmented: Whether the picture includes the ids of bodies. Edges in the depth are then
-            sharp, at the same pixels as edges of the ids; otherwise they may be smoothed.
+        segmented: Whether the picture includes the ids of bodies. If True, the depth and the id of
+            a pixel belong to the same body. If False, the engine may smooth the depth at the edges
+            of bodies.
     """
 
     camera: Camera
@@ -213,7 +214,7 @@ def paint_shadows(picture: Picture, view: View, casters: ArrayLike) -> None:
 
 
 def paint_markers(picture: Picture, view: View, centres: ArrayLike, radius: float) -> None:
-    """Paint goal markers into a picture: translucent spheres that shine through bodies.
+    """Paint goal markers: translucent spheres that stay visible, but fainter, behind bodies.
 
     Args:
         picture: Picture, with or without a depth; its colours are changed.

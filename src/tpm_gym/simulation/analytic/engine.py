@@ -32,7 +32,11 @@ from tpm_gym.simulation.settings import settings_of
 from tpm_gym.simulation.state import Scene
 
 _CHECK_ABOVE = 0.5
-"""Fraction of a motor's largest torque above which the torques of all time steps are computed."""
+"""Fraction of a motor's largest torque.
+
+If a torque in the last time step of a control period is above this fraction, the torques in all
+time steps of the period are computed.
+"""
 _NEAR_PLANE = 1.2
 """Largest distance from the plane of symmetry at which P is near the plane.
 
@@ -278,13 +282,13 @@ class AnalyticEngine:
         return over
 
     def _torques(self, rows: IntArray, theta: FloatArray, push: FloatArray) -> FloatArray:
-        """Compute the torques of some robots in the last k time steps, (r, k, 3) N m.
+        """Compute the torques of r robots in the last k time steps, (r, k, 3) N m.
 
         Args:
             rows: (r,) indices of the robots.
-            theta: (r, m + 2, 3) rad, joint positions at the ends of the last m + 2 time steps.
+            theta: (r, k + 2, 3) rad, joint positions at the ends of the last k + 2 time steps.
             push: (r, K, 3) N, force of cup and objects on P in each of K time steps; the forces in
-                the last m time steps are used.
+                the last k time steps are used.
         """
         joints, rates, changes = loops().differences(theta, self.time_step)
         built = None if self._built is None else self._built[rows]

@@ -281,7 +281,8 @@ def _moving(mass: Symmetric, impulse: Vector, limit: Vector, signs: Vector) -> V
 def _bounded(matrix: Symmetric, wanted: Vector, most: Vector) -> Vector:
     """Find x from -``most`` to ``most`` that minimises x @ matrix @ x / 2 - wanted @ x.
 
-    At the minimum, some components of x are at a bound, and the cost is stationary in the others.
+    At the minimum, some components of x may be at a bound. With respect to each other component,
+    the derivative of the minimised function is zero.
     """
     found, best = _ZERO, np.inf
     for choice in range(27):  # all combinations of no bound, upper bound and lower bound

@@ -1,4 +1,7 @@
-"""Vacuum cup in PyBullet: a fixed joint (weld) holds an object until the vacuum law releases it."""
+"""Vacuum cup in PyBullet: a fixed joint (weld) holds an object until the vacuum law releases it.
+
+The vacuum law is in :mod:`tpm_gym.simulation.vacuum`.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,8 @@ _FASTEST = 2.5  # m/s, largest speed of lip towards object: twice the largest co
 class Cup:
     """Vacuum cup on a robot's platform; it can hold one object.
 
-    The weld keeps a gap of 20 um between lip and object. Without a gap, their contact would act
-    against the weld.
+    A fixed joint (weld) holds the object 20 um below the lip. Without this gap, the contact between
+    lip and object would act against the weld.
 
     Args:
         client: Physics client.
@@ -73,7 +76,7 @@ class Cup:
         return self._near
 
     def update(self, on: bool) -> None:
-        """Apply the vacuum law after a time step: change the vacuum, hold or release an object."""
+        """Update vacuum and held object after a time step, by the law :func:`hold_after`."""
         hold, pose = self.grip
         load = Load() if pose is None else self._load()
         touched = self._touched() if on and pose is None else -1
@@ -101,8 +104,8 @@ class Cup:
     def _load(self) -> Load:
         """Return the force of the weld in the last time step.
 
-        PyBullet reports the force along the world's axes. The cup's axis is vertical. So the
-        tension is the negative z component, and the x and y components are the shear.
+        PyBullet reports the force along the world's axes, and the cup's axis is vertical. So the
+        tension is minus the z component, and the x and y components are the shear.
         """
         x, y, z, *_ = self._client.getConstraintState(self._weld)
         return Load(-z, math.hypot(x, y))

@@ -5,9 +5,10 @@ normal force) along each of two directions. If an object slips at 45 degrees to 
 friction is sqrt(2) times too strong. At other oblique angles, friction is also not opposite to the
 slip. On a level face the directions are the world's x and y, and Bullet can scale both limits for
 each body. For a slipping contact, this module scales both limits so that a corner of the box lies
-on the cone, opposite to the slip. For a sticking contact, the module computes the limit along x
-from the cone and the friction along y in the last time step, and the limit along y from the
-friction along x. If this friction was zero or very small, its next direction is unknown. Then the
+on the cone, opposite to the slip. For a sticking contact, the module assumes that the friction
+along y stays as in the last time step. The limit along x is then the largest friction along x that
+lies in the cone. The limit along y is computed likewise from the friction along x. If the total
+friction in the last time step was zero or very small, its next direction is unknown. Then the
 module chooses a box inside the cone.
 
 **Slides.** All points of a contact share these scales, and contacts between objects have no scales.
@@ -54,8 +55,9 @@ _NOTHING = 1e-6  # N, N m; smaller ones are rounding, and would only disturb the
 _Push = tuple[Vector, float]
 """Record of the friction force that was added to a contact in a time step: a vector and a limit, N.
 
-The vector is the steady part of the added force (see ``compiled.friction_force``). The limit is the
-largest magnitude of the added force: mu * N minus the solver's friction.
+The vector is the steady part of the added force: the part that holds a block that sticks (see
+``compiled.friction_force``). The limit is the largest allowed magnitude of the added force: mu * N
+minus the solver's friction.
 """
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _NONE: _Push = (_ZERO, 0.0)
@@ -106,8 +108,8 @@ class Friction:
 
     Args:
         bodies: Body ids of the objects.
-        tables: Body ids of the tables, one per object, because objects slide in different
-            directions.
+        tables: Body ids of the tables, one per object: objects slide in different directions, and
+            Bullet's friction scales apply to a whole table.
         belts: Body ids of the belts, one per object; empty without a belt.
         time_step: Time step, s.
     """

@@ -23,7 +23,8 @@ class Physics(Numerics):
         time_step: Time step, s; the control period must be an integer multiple of it.
         solver: ``"direct"`` solves the constraints of a time step exactly (Dantzig's pivoting);
             ``"iterative"`` is Bullet's default, sequential impulses.
-        iterations: Iterations of the iterative solver per time step; with 25, loops open sometimes.
+        iterations: Number of iterations of the iterative solver in each time step. With 25
+            iterations, loops sometimes open.
         erp: Fraction of a constraint's error that is removed in one time step, in (0, 1].
 
     Raises:

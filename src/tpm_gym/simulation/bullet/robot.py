@@ -3,7 +3,8 @@
 Each leg of the spanning tree is loaded as a separate multibody, so that every loop closure joins
 two multibodies. With a closure inside one multibody, Bullet's direct solvers compute wrong forces
 and the loop opens at once. With closures between multibodies, the forces are exact
-(docs/loops.md). Separate multibodies also make the constraint rows of the solver shorter.
+(docs/loops.md). The Jacobian of each constraint is also smaller, because it has only the joints of
+the legs on which the constraint acts.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Vacuum cup in MuJoCo: a weld holds an object until the vacuum law releases it."""
+"""Vacuum cup in MuJoCo: a weld holds an object until the vacuum law releases it.
+
+The vacuum law is in :mod:`tpm_gym.simulation.vacuum`.
+"""
 
 from __future__ import annotations
 

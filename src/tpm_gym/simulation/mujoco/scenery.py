@@ -65,7 +65,7 @@ class Scenery:
             wanted[:] = before - self._hop(slip)
 
     def _rows(self) -> slice:
-        """Return the constraint rows of the contacts: the last rows, three per contact."""
+        """Return the slice of MuJoCo's ``efc_*`` arrays for contacts, three entries per contact."""
         return slice(self._data.nefc - 3 * self._data.ncon, None)
 
     def _slip(self, velocity: FloatArray) -> FloatArray:
@@ -80,7 +80,7 @@ class Scenery:
         return hop
 
     def _predicted_velocity(self) -> FloatArray:
-        """Predict the velocities of all constraint rows at the end of this time step."""
+        """Predict the velocity along each constraint (``efc_vel``) after this time step."""
         model, data = self._model, self._data
         mujoco.mj_fwdActuation(model, data)
         mujoco.mj_fwdAcceleration(model, data)

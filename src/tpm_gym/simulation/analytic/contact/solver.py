@@ -186,8 +186,8 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
         count: Number of contacts.
         bodies: Bodies of the contacts; their velocities are changed.
         motor: Spring that drives body 0, the cup.
-        calm: Whether to stop as soon as all objects are :func:`still`, because the impulses then
-            balance all forces.
+        calm: Whether to end the iterations as soon as objects and belt are :func:`still`, because
+            the contact impulses then balance the other forces on the objects.
     """
     spring, cup = 0.0, bodies[0]["velocity"]
     for sweep in range(_SWEEPS):
@@ -204,7 +204,7 @@ def solve(contacts: Records, count: int, bodies: Records, motor: Motor, calm: bo
 
 @compiled
 def still(bodies: Records) -> bool:
-    """Return whether the speeds of all objects are below ``_STILL`` and ``_UNTURNED``."""
+    """Return whether objects and belt are slower than ``_STILL`` and ``_UNTURNED`` (rad/s)."""
     for index in range(1, len(bodies)):
         velocity, spin = three(bodies[index]["velocity"]), three(bodies[index]["spin"])
         if dot(velocity, velocity) > _STILL**2 or dot(spin, spin) > _UNTURNED**2:

@@ -84,9 +84,9 @@ class Setting(NamedTuple):
     """Constants of a simulation.
 
     Attributes:
-        half: (k, 3) m, half edge lengths of the objects.
+        half: (k, 3) m, half edge lengths of the k objects.
         table: Three bounds of the surface that table and belt form together, m: lowest x, highest
-            x, and highest y (half of the width).
+            x, and highest y (half of the surface's width).
         belt_end: Highest x of the belt, m; minus infinity without a belt.
         step: Time step, s.
         turn: Signs (1 or -1). The components of a vector in the machine's frame times these signs
@@ -109,8 +109,9 @@ class Tables(NamedTuple):
         objects: (n, k) records of :data:`OBJECT`.
         cups: (n,) records of :data:`CUP_STATE`.
         forces: (n, slots(k), 3) N, contact forces of the last time step.
-        awake: (n,) whether objects or cup may change while the lip is far from all objects. If
-            False, time steps are skipped until the lip may touch an object.
+        awake: (n,) False if all objects on a table are at rest, and the cup is empty, with vacuum
+            and slide at 0. Time steps of this table are then skipped until the lip may touch an
+            object.
         belts: (n,) m/s, speeds of the belts along x.
     """
 
@@ -146,7 +147,8 @@ class Work(NamedTuple):
     Attributes:
         bodies: (k + 2,) records of :data:`BODY`: the cup, the objects, the belt.
         contacts: (slots(k),) records of :data:`CONTACT`.
-        polygons: (2, 12, 3) m, corners of two polygons, to clip faces.
+        polygons: (2, 12, 3) m, corners of two polygons with up to 12 corners each, for the overlap
+            of two faces.
     """
 
     bodies: Records

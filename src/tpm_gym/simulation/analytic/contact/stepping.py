@@ -294,7 +294,11 @@ def _step(
 def _fill(
     objects: Records, cup: Record, way: Way, mass: float, setting: Setting, bodies: Records
 ) -> None:
-    """Set the masses of the solver's bodies, and the velocities that they have without contacts."""
+    """Set the masses and the initial velocities of cup and objects for the solver.
+
+    The velocities are those at the end of the time step if no contact force and no force of the
+    cup's spring acts.
+    """
     step, body = setting.step, bodies[0]
     x, y, _ = plus(way.then, way.now, -1.0)
     z = (way.now[2] - way.before[2]) / step + cup["slide_rate"]
