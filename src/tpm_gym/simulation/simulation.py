@@ -31,11 +31,12 @@ CLOSURE_LIMIT = 0.005
 _STEPS = 10  # time steps of a control period other than 40 ms, if the settings have no time step
 
 _BLUR = 0.05
-"""Distance between P and the machine's plane of symmetry, as a fraction of a step limit.
+"""Distance of P from the mirror plane at which the observed velocity normal to it is halved.
 
-If P is at this distance, the observed velocity of P normal to the plane is half of the component of
-J theta_dot normal to the plane. If P is in the plane, this observed velocity is zero. The plane is
-normal to ``mirror_axis``. The step limit is the machine's ``step_limit`` along this axis.
+The distance is a fraction of the machine's ``step_limit`` along ``mirror_axis``, which is normal to
+the plane. If P is in the plane, encoders do not show its velocity normal to the plane. So this
+component of J theta_dot is multiplied by d^2 / (d^2 + h^2), where d is the distance of P from the
+plane, and h is the distance that this constant defines.
 """
 
 _COLUMNS = (
@@ -50,7 +51,7 @@ class Snapshot:
 
     Attributes:
         plants: Plant of each of the n robots.
-        columns: Arrays (n, ...) of the simulation, by name.
+        columns: Arrays (n, ...) that :class:`Simulation` keeps outside the engine, by name.
         engine: Saved state of the engine, from :meth:`Engine.save`.
     """
 
@@ -203,7 +204,11 @@ class Simulation:
         self._state = None
 
     def _places(self, count: int, objects: Mapping[str, ArrayLike]) -> FloatArray:
-        """Return upright poses (r, k, 7) of the objects, in the order of the scene."""
+        """Return upright poses (r, k, 7) of the scene's k objects, for r = ``count`` robots.
+
+        ``objects`` has centres (r, 3) m, world, by name. Objects without an entry are placed in the
+        middle of the table.
+        """
         places = np.zeros((count, len(self.scene.objects), 7))
         places[..., 6] = 1.0
         names = [block.name for block in self.scene.objects]
@@ -329,15 +334,16 @@ class Simulation:
     def _mirrored(
         self, truth: FloatArray, rates: FloatArray, position: FloatArray, jacobian: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Mirror P (n, 3) m and J (n, 3, 3) of robots that are not on home's side of a plane.
+        """Mirror P (n, 3) m and J (n, 3, 3) of robots whose P is not on home's side of a plane.
 
         This mirror plane is normal to ``mirror_axis``. A point P and its mirror image have the
         same joint positions, so encoders do not show on which side of the plane P is. The sign of a
         passive joint's position shows the side. A switch would measure this sign on a real robot.
 
-        P may turn back at the plane although its commands lead through the plane. Then P stays on
-        the near side, but the path of its commands ends on the far side. So the commands are
-        mirrored to the near side. This does not change the joint positions on the path.
+        P may turn back at the plane although its commands lead through the plane. P is then on one
+        side, and the path of the commands ends on the other side. If the end of this path is more
+        than a step limit from the plane, the stored commands are mirrored too, to the side of P.
+        This does not change the joint positions on the path.
 
         Args:
             truth: (n, 3) m, P of the platform, world.

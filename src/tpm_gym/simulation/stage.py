@@ -70,7 +70,7 @@ def boards(table: tuple[float, float], belt: Belt | None) -> list[tuple[Slab, fl
 
 
 def painted(scene: Scene) -> list[Patch]:
-    """Return the scene's painted rectangles, and arrows along its belt, made of rectangles."""
+    """Return the scene's painted rectangles, and the rectangles that form arrows on its belt."""
     patches = list(scene.patches)
     if scene.belt is not None:
         tip, thick = scene.belt.end - _ARROW_LENGTH, _ARROW_LENGTH / _SLICES

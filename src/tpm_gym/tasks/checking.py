@@ -30,8 +30,8 @@ def check(task: Task, taken: Sequence[str] = ()) -> None:
 
     A task cannot start if the machine has no room for it, or has no tempting goals (just above the
     threshold of safe conditioning) although ``goals`` is ``"tempting"``. A method that reduces over
-    the robots (``np.linalg.norm(x)`` without ``axis=-1``), or confuses rows with columns, gives
-    wrong rewards in vector environments without an error.
+    the robots (``np.linalg.norm(x)`` without ``axis=-1``), or confuses the axis of the robots with
+    another axis, gives wrong rewards in vector environments without an error.
 
     Args:
         taken: Names that no event may have.

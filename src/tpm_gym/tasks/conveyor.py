@@ -40,11 +40,11 @@ _DRAWS: Final = 256
 class Conveyor(Task):
     """Pick up a block from a running belt with the vacuum cup, and bring it to the tray.
 
-    The belt runs along x, at 0.05 to 0.20 m/s, drawn for each episode. The block comes within reach
-    in the first second. The camera shows it 3 control steps late, in the observation and in the
-    achieved goal. The goal lies in the tray, on the table beyond the belt. With
-    ``goals="tempting"``, the robot's lowest conditioning is just above the safe threshold on each
-    of two lines along x: the block's way on the belt, and the line in the tray through the goal.
+    The belt runs along x. Its speed, 0.05 to 0.20 m/s, is drawn for each episode. The block comes
+    within reach in the first second. The camera shows the block 3 control steps late, in the
+    observation and in the achieved goal. The goal lies in the tray, on the table beyond the belt.
+    With ``goals="tempting"``, the block and the goal each lie on a line parallel to x. On both
+    lines, the robot's lowest conditioning is just above the safe threshold.
     """
 
     block = Block()
@@ -87,7 +87,7 @@ class Conveyor(Task):
 
     @cached_property
     def _floor(self) -> tuple[FloatArray, FloatArray]:
-        """Low and high corner (3,) m, world, of the box of block centres on belt and tray."""
+        """Low and high corner (3,) m, world, of the area where a block's centre is within reach."""
         table, hung = self.on_table(self.block), hanging(self.block)
         ends = self.machine.mount.to_world(np.array([table.low, table.high])) - hung
         return ends.min(axis=0), ends.max(axis=0)
@@ -208,9 +208,9 @@ class _Camera:
         return self._seen("position") + steps * way
 
     def above(self, height: float) -> FloatArray:
-        """Return the command (3,) m for the lip to be ``height`` m over the block after the step.
+        """Return the command (3,) m that brings the lip to a ``height`` (m) above the block.
 
-        P lags the command by half a control period.
+        The lip is there when the control step ends. P lags the command by half a control period.
         """
         point = self.place() + hanging(self.block) + (0.0, 0.0, height)
         command: FloatArray = self.motion.machine.mount.to_paper(point) + 1.5 * self.step()

@@ -21,7 +21,7 @@ from tpm_gym.tasks.timing import timed
 
 STROKE: Final = 0.305
 RISE: Final = 0.025
-"""Size of P's path, m: P moves up by RISE, by STROKE along x, and down by RISE."""
+"""Height of P's path, m. P moves up by RISE, along x by STROKE, and down by RISE."""
 BLEND: Final = 0.050
 """Length of a corner along x, m. A corner is a cubic Lame curve, |x / BLEND|^3 + |z / RISE|^3 = 1.
 
@@ -34,9 +34,9 @@ PAYLOAD: Final = 0.1
 CONTINUOUS: Final = 0.98 * TORQUE_MOTOR.continuous_torque / TORQUE_MOTOR.peak_torque
 """Largest RMS torque of a plan, as a share of the peak torque; 0.98 leaves a reserve for servos."""
 SHARES: Final = (0.65, 0.1, 0.65)
-"""Acceleration limits along x, y, z: shares of P's largest acceleration along each axis alone."""
+"""Acceleration limits along x, y, z, as shares of P's largest acceleration along one axis only."""
 BRAKING: Final = (0.8, 0.8, 0.25)
-"""Decelerations along x, y, z before the ends of the region, as shares of the accelerations.
+"""Deceleration limits along x, y, z before the region's ends: shares of the acceleration limits.
 
 The motors must be able to brake along x and z at the same time. So the share along z is small:
 there, the path ends far from the end of the region, and P has a long way to brake.
@@ -44,7 +44,7 @@ there, the path ends far from the end of the region, and P has a long way to bra
 NEAR: Final = 0.010
 """Distance to the goal, m; at this and larger distances, a dense reward's extra term is -1."""
 UNIT: Final = 0.005
-"""Depth, m. If P is below the gate-shaped way by tolerance + UNIT, the reward term "gate" is -1."""
+"""Unit of the reward term "gate", m: the term is -1 if P is tolerance + UNIT below the path."""
 POINTS: Final = 120
 SHOWN: Final = 12
 """Number of points of the path between two markers."""
@@ -169,7 +169,7 @@ class Cycle(Task):
         return goal
 
     def goals_of(self, block: Block | None) -> list[tuple[FloatArray, FloatArray]]:
-        """Return the box of all goals at each end of the path: low, high corner (3,) m, world."""
+        """Return two goal boxes, one at each end of the path: low and high corner (3,) m, world."""
         depths = self.machine.goal_region.low[1], self.machine.goal_region.high[1]
         boxes = []
         for end in self._ends.tolist():
@@ -184,7 +184,7 @@ class Cycle(Task):
         return points
 
     def goal_term(self, gap: FloatArray) -> FloatArray:
-        """Return -gap / 0.1 m - min(gap / 10 mm, 1) if dense; if sparse, the base class's term."""
+        """Return -gap / 0.1 m - min(gap / 10 mm, 1); for a sparse reward, the base class's term."""
         term = super().goal_term(gap)
         return term if self.reward == "sparse" else term + dense(np.minimum(gap, NEAR), NEAR)
 

@@ -1,9 +1,8 @@
-"""The expert: the scripted controller of all tasks, on closed-form kinematics.
+"""The expert: the scripted controller of all tasks. It uses closed-form kinematics.
 
 The expert gets the same observation as a policy. For each robot it follows the task's plan, which
 moves point P with trapezoidal speed, and converts each command into an action of the environment's
-control. A move between two safe points stays safe: y, on which the conditioning depends, changes
-monotonically along with x and z.
+control. A straight move of P between safe positions is safe (see :mod:`tpm_gym.tasks.sampling`).
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ class Expert:
 
     Args:
         env: A :class:`~tpm_gym.TPMEnv`, wrapped or not, or a :class:`~tpm_gym.TPMVectorEnv`. The
-            expert reads only the environment's task, control, latency and number of episodes.
+            expert uses only the environment's task, control, latency and count of episodes so far.
 
     Raises:
         InputError: If ``env`` is no such environment.

@@ -50,9 +50,10 @@ class Move(NamedTuple):
 
 
 class Motion:
-    """Observation of one robot for its plan, and methods that yield moves of point P.
+    """Observation of one robot for its plan, and methods that yield the commands of a motion of P.
 
-    The speed of a move rises, holds and falls (see :meth:`trapezoid`).
+    A :class:`Move` has the command of one control step. In a motion, the speed of P rises, holds
+    and falls (see :meth:`trapezoid`).
 
     Attributes:
         machine: The machine that moves.
@@ -120,7 +121,7 @@ class Motion:
         Args:
             stops: Points (3,) m.
             vacuum: Whether the vacuum is on.
-            while_holding: Name of an object; the move ends early if the cup loses it.
+            while_holding: Name of an object; the motion ends early if the cup loses this object.
             rounded: Whether P cuts the corners at the stops instead of coming to rest there.
         """
         for part in [stops] if rounded else [[stop] for stop in stops]:
@@ -172,9 +173,9 @@ class Motion:
         """Come down on a block from ``clearance`` (m) above it, and wait for the seal.
 
         Args:
-            clearance: Height over the block from where P comes down, m.
+            clearance: Height of the lip above the block when P begins to come down, m.
             gently: Whether P stops above the block, and then comes down slowly until the cup seals.
-                Otherwise the cup presses the block on the table.
+                Otherwise the cup presses the block against the table.
 
         Raises:
             ConfigurationError: If the task does not observe the block.

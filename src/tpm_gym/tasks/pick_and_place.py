@@ -56,7 +56,7 @@ class PickAndPlace(Task):
 
     @cached_property
     def _regions(self) -> dict[str, list[Region]]:
-        """Regions of P with the block in the cup: at its start ("object"), and at its goal."""
+        """Regions of P with the block in the cup: key "object" for starts, key "goal" for goals."""
         table = self.on_table(self.block)
         x, y, level = table.high
         air = Region(self.machine.goal_region.low, (x, y, level - sampling.APART))

@@ -180,8 +180,8 @@ class Task(ABC):
         Args:
             rngs: A generator for each episode. An episode draws from its own generator only, so
                 that its values do not depend on the other episodes.
-            chosen: Values by name, (r, ...) each, that the user has chosen, within reach. The
-                result contains them unchanged, and sampled positions keep clear of them.
+            chosen: Values (r, ...) that the user has chosen, by name. They are within reach. The
+                result contains them unchanged. Sampled positions must not be too near to them.
 
         Returns:
             Centres (r, 3) m of the scene's objects by name, and ``"goal"`` (r, goal_size) m. The

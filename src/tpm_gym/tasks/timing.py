@@ -71,18 +71,32 @@ def _spans(squared: FloatArray) -> FloatArray:
 
 
 def _torques(squared: FloatArray, begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the torques (N, 3) between points, without gravity."""
+    """Return the torques (N, 3) N m between the points of a path, without gravity.
+
+    Between points k and k + 1, the torque is begin[k] squared[k] + end[k] squared[k + 1].
+
+    Args:
+        squared: (N + 1,) (ds/dt)^2 at the points; see :func:`timed`.
+        begin: (N, 3) factors of ``squared`` at the first point of each span between points.
+        end: (N, 3) factors of ``squared`` at the last point of each span.
+    """
     return begin * squared[:-1, None] + end * squared[1:, None]
 
 
 def _cost(squared: FloatArray, begin: FloatArray, end: FloatArray) -> float:
-    """Return the time plus the heat, the integral of the squared torques over time."""
+    """Return the time plus the heat, the integral of the squared torques over time.
+
+    :func:`_torques` explains the arguments.
+    """
     heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
     return float(_spans(squared) @ (1 + heat))
 
 
 def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
-    """Minimise time plus heat by Newton's method; return (ds/dt)^2 (N + 1,), zero at both ends."""
+    """Minimise time plus heat by Newton's method; return (ds/dt)^2 (N + 1,), zero at both ends.
+
+    :func:`_torques` explains the arguments.
+    """
     s = np.linspace(0.0, 1.0, len(begin) + 1)
     squared = s * (1 - s)
     heat = (_torques(squared, begin, end) ** 2).sum(axis=1)
@@ -107,7 +121,10 @@ def _fastest(begin: FloatArray, end: FloatArray) -> FloatArray:
 def _derivatives(
     squared: FloatArray, begin: FloatArray, end: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return gradient (N - 1,) and Hessian (N - 1, N - 1) of the cost in ``squared[1:-1]``."""
+    """Return the gradient (N - 1,) and the Hessian (N - 1, N - 1) of :func:`_cost`.
+
+    The variables are ``squared[1:-1]``. :func:`_torques` explains the arguments.
+    """
     count, spans, torques = len(begin), _spans(squared), _torques(squared, begin, end)
     speed = np.sqrt(squared)
     weight = 1 + (torques**2).sum(axis=1)
@@ -141,9 +158,19 @@ def _scale(
     continuous: FloatArray,
     peak: FloatArray,
 ) -> float:
-    """Find the smallest factor for which no motor exceeds its limits.
+    """Find by bisection the smallest factor on all times with which no motor exceeds a limit.
 
-    All times are multiplied by this factor. The search is a bisection.
+    A factor f divides ``torques`` by f^2, and does not change ``rest``.
+
+    Args:
+        spans: (N,) s, times from point to point.
+        torques: (N, 3) N m, torques between the points, without gravity.
+        rest: (N, 3) N m, torques that hold the weight between the points.
+        continuous: (3,) N m, largest RMS torque of each motor.
+        peak: (3,) N m, largest torque of each motor.
+
+    Raises:
+        ConfigurationError: If a motor cannot hold the weight.
     """
 
     def fits(factor: float) -> bool:

@@ -25,10 +25,10 @@ _OURS: Final = "__VISER_EMBED_DATA__="
 
 
 def export(folder: str | Path, machine: str | Machine) -> Path:
-    """Write ``index.html``, an episode of pick-and-place by the expert in a loop; return its path.
+    """Write ``index.html`` and return its path; the page repeats one episode of pick-and-place.
 
-    The page holds everything it needs. The engine is the analytic one. The folder is made if it is
-    missing. An earlier page is replaced.
+    The expert performs the task in the analytic engine. The page holds everything it needs. The
+    folder is made if it is missing. An earlier page is replaced.
 
     Raises:
         ConfigurationError: If no machine has this name, the machine cannot do the task, the folder

@@ -199,10 +199,17 @@ class Play:
     def _draw(
         self, place: int, title: str, names: tuple[str, ...], rows: Sequence[Any], length: int
     ) -> None:
-        """Show curves in one plot at ``place``, and hide the other plots there.
+        """Show curves in one plot of ``self.plots[place]``, and hide the other plots of this group.
 
         Each combination of ``names`` and ``length`` has its own plot. The other plots are not
         removed, because a page may still have to process updates of them.
+
+        Args:
+            place: 0 for the reward terms, 1 for the torques.
+            title: Title of the plot.
+            names: Labels of the curves.
+            rows: The numbers of the steps, then the values of each curve.
+            length: Number of steps of a full episode.
         """
         key, data = (names, length), tuple(np.asarray(row, dtype=np.float64) for row in rows)
         plots = self.plots[place]

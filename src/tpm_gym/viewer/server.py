@@ -41,7 +41,10 @@ def stop(server: ViserServer) -> None:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return the first free port from ``port`` on; viser alone would never stop trying."""
+    """Return the first free port from ``port`` on.
+
+    Viser has its own search, but waits without end if the search finds no free port.
+    """
     for candidate in range(port, min(port + _TRIES, 65536)):
         if (found := _bound(host, candidate)) is not None:
             return found

@@ -117,9 +117,10 @@ class Viewer:
 
 
 def _named_kinds(machine: str | Machine) -> tuple[str, dict[str, Kind]]:
-    """Return the name of ``machine``, and the kinds of it and of all registered machines by name.
+    """Return the name of ``machine``, and a dictionary of kinds by name.
 
-    The registered name counts: several machines may have one ``Machine.name``.
+    The dictionary has the kinds of ``machine`` and of all registered machines. Registered machines
+    have their names in the registry, because several may have the same ``Machine.name``.
     """
     given = find_kind(machine)
     kinds = {name: find_kind(name) for name in machine_names()}

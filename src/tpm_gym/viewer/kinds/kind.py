@@ -176,10 +176,12 @@ class Kind:
 
 
 def elbows(out: Sequence[float]) -> dict[str, tuple[Any, ...]]:
-    """Return the signs of a working mode's three legs for labels such as ``"out / in / out"``.
+    """Return the working modes by label, such as ``"out / in / out"``.
+
+    A working mode is given by three signs, one for each leg.
 
     Args:
-        out: For each leg, its sign in working modes in which the leg's elbow is out.
+        out: For each leg, the sign if its elbow is out. The sign is opposite if the elbow is in.
     """
     words = {"out": 1, "in": -1}
     return {
