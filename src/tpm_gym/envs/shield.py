@@ -217,7 +217,7 @@ class BrakingShield:
         path of braking.
 
         Args:
-            wanted: (n, 3) m, commands by control and follower, machine's frame.
+            wanted: (n, 3) m, commands before the shield, machine's frame.
             recent: (n, 2, 3) m, the last two commands.
         """
         reached = self._lowest(wanted, recent)
@@ -331,7 +331,10 @@ def solved(
     low: FloatArray,
     high: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve problems with linearised conditioning, by Hildreth's method.
+    """Find the commands nearest to the wanted ones under constraints, by Hildreth's method.
+
+    The constraints are: the linearised conditioning exceeds that at ``point`` by at least ``lack``,
+    the command is between ``low`` and ``high``, and the action is possible.
 
     The search begins at the wanted command, and treats the constraints in turn. A constraint that
     is violated pushes the solution found so far until the constraint holds with equality. If a

@@ -225,7 +225,7 @@ def link3_rotated(theta: FloatArray, geometry: Geometry = PAPER) -> tuple[_Plana
     kappa = (b2 - b1)[..., 0, None] + 2 * g.l5 + 1j * (b2 - b1)[..., 2, None]
 
     def terms(tilt: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return rho^2, and p and q of the closure of rod 6, 2 rho p = q, at a tilt.
+        """Return rho^2, p and q at a tilt. The closure of rod 6 is 2 rho p = q.
 
         |rho| is the distance from B1 to C1 seen along y, m.
         """

@@ -85,7 +85,7 @@ _SHIELD_HINT: Final = tyro.conf.arg(help_behavior_hint="(default: False; evaluat
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of an environment. The default "the id's" is the value set by the environment id."""
+    """Options of an environment. The environment id sets the defaults."""
 
     machine: Annotated[str, unset(str, "the id's; evaluate: the policy's", "NAME")] = UNSET
     """Robot: paper, wide, delta, or one that your module registers."""
@@ -139,8 +139,7 @@ class TrainingConfig:
     algo: Annotated[
         str, unset(str, "one that has a recipe for <env>", "{" + ",".join(ALGORITHMS) + "}")
     ] = UNSET
-    """Algorithm: sac or tqc for sparse rewards; ppo for dense rewards (ids that contain Dense), or
-    for sparse rewards with demonstrations."""
+    """Algorithm: sac, tqc, or ppo (needs a Dense id or demonstrations)."""
 
     env: Annotated[str, tyro.conf.arg(metavar="ID")] = "TPMReach-v0"
     """Environment id, or module:id if a module of yours registers it."""
@@ -188,8 +187,8 @@ class TrainingConfig:
     """Episodes of an evaluation."""
 
     test_episodes: int = 100
-    """Episodes of each final test; 0 for no test. Only a training with --engine analytic has final
-    tests: the best policy is tested in the analytic engine and in PyBullet."""
+    """Episodes of each final test, in the analytic engine and in PyBullet; 0 for no test. Only
+    trainings with --engine analytic have final tests."""
 
     checkpoint_every: Annotated[int | None, unset(int, "by time", "INT")] = None
     """Steps between checkpoints. By default, a checkpoint is saved every 30 s, or less often, so

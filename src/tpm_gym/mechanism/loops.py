@@ -109,7 +109,7 @@ def _fill(built: FloatArray, start: int, count: int, each: int, own: FloatArray)
 
 
 def _read(rows: FloatArray, start: int, count: int, columns: FloatArray, first: int) -> None:
-    """Copy ``count`` rows, beginning at row ``start``, to three columns, beginning at ``first``.
+    """Copy ``count`` rows from row ``start`` on to the three columns from column ``first`` on.
 
     ``rows`` is (n, 3).
     """

@@ -108,10 +108,9 @@ class Randomisation:
 
     Attributes:
         link_mass: Factor of mass and inertia, drawn for each moving link; within 0.5 to 16.
-        block_mass: Factor of the objects' masses (nominally 50 g); within 0.1 to 10.
-        friction: Factor of the objects' friction (nominally 0.6 on the table); within 0.1 to 3.
-        motor_strength: Factor of each motor's largest torque (nominally 100 N m); within 0.05 to
-            1.5.
+        block_mass: Factor of the objects' nominal masses (50 g); within 0.1 to 10.
+        friction: Factor of the objects' nominal friction (0.6 on the table); within 0.1 to 3.
+        motor_strength: Factor of each motor's nominal largest torque (100 N m); within 0.05 to 1.5.
         servo_stiffness: Factor of each drive's stiffness, at nominal damping; within 0.01 to 4.
             Requires ``drive="servo"``.
         joint_friction: Coulomb friction on each motor's axis, N m; within 0 to 100. Requires

@@ -70,7 +70,7 @@ class Crossing(Task):
 
 
 def _stripe(machine: Machine) -> Patch:
-    """Return a stripe on the table below the plane y = 0."""
+    """Return a stripe on the table where the plane y = 0 meets it."""
     ends = np.array([machine.region.low, machine.region.high])
     ends[:, machine.mirror_axis] = -STRIPE, STRIPE
     low, high = np.sort(machine.mount.to_world(ends)[:, :2], axis=0).tolist()

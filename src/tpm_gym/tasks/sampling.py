@@ -61,7 +61,7 @@ def safe_points(
     apart: float = APART,
     near_singularity: bool = False,
 ) -> dict[str, FloatArray]:
-    """Draw safe points of regions, by name, at least ``apart`` (m) from each other.
+    """Draw a safe point for each name in ``regions``, at least ``apart`` (m) from each other.
 
     Args:
         rngs: One generator for each of the r robots.

@@ -431,7 +431,7 @@ def _scales(
 
 
 def _along(x: float, y: float) -> tuple[float, float]:
-    """Return scales for which a corner of the friction box is on the cone along (x, y)."""
+    """Return scales of the friction box whose corner in direction (x, y) is on the cone."""
     length = max(math.hypot(x, y), 1e-12)
     return max(abs(x) / length, _LEAST), max(abs(y) / length, _LEAST)
 
