@@ -277,7 +277,7 @@ def test_demonstrations_are_counted_as_they_are_played(tmp_path):
     waits = [line for line in said(console).splitlines() if line.endswith("...")]
     assert waits == [
         "playing 4 demonstrations of the expert and learning from them ...",
-        "first evaluation, before the policy acts ...",
+        "first evaluation, before training ...",
     ]
     assert said(console).index("212 steps, in") < said(console).index(waits[0])
     assert said(console).index(waits[1]) < said(console).index("200 steps   success")

@@ -48,7 +48,7 @@ class PeriodicEvaluation(BaseCallback):
 
     def _on_training_start(self) -> None:
         if not self.evaluations:
-            self.console.print("first evaluation, before the policy acts ...")
+            self.console.print("first evaluation, before training ...")
             self._evaluate()
 
     def _init_callback(self) -> None:
