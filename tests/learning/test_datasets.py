@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from datasets_on_record import COUNTS, records
 from paths import ROOT
-from registries import registries_put_back
+from registries import register_like, registries_put_back
 from trainings import quiet
 
 from tpm_gym.errors import ConfigurationError
@@ -226,14 +226,8 @@ def test_datasets_are_those_on_record(env_id):
 
 
 def test_an_id_that_names_no_task_is_collected_with_the_default_one(tmp_path):
-    spec = gym.spec(REACH)
     with registries_put_back():
-        gym.register(
-            "Plain-v0",
-            entry_point=spec.entry_point,
-            vector_entry_point=spec.vector_entry_point,
-            max_episode_steps=5,
-        )
+        register_like(REACH, "Plain-v0", steps=5, kwargs={})
         (folder,) = collect(config(tmp_path, "expert", env="Plain-v0", episodes=2), quiet())
     assert minari.MinariDataset(folder / "data").total_steps == 10
 
@@ -255,15 +249,8 @@ class Unregistered(Reach):
     ],
 )
 def test_the_environment_of_an_own_id_is_recovered_or_refused_early(tmp_path, options, refused):
-    spec = gym.spec(REACH)
     with registries_put_back():
-        gym.register(
-            "Own-v0",
-            entry_point=spec.entry_point,
-            vector_entry_point=spec.vector_entry_point,
-            max_episode_steps=5,
-            kwargs={**spec.kwargs, **options},
-        )
+        register_like(REACH, "Own-v0", steps=5, kwargs={**gym.spec(REACH).kwargs, **options})
         given = config(tmp_path, "random", env="Own-v0", episodes=1)
         if refused:
             with pytest.raises(ConfigError, match=refused):

@@ -20,7 +20,7 @@ import pytest
 from episodes import expert_episode
 from paths import read_strict
 from processes import PYTHON, TPM_GYM, printed_by, signalled
-from registries import registries_put_back
+from registries import register_like, registries_put_back
 from trainings import quiet, said
 
 import tpm_gym
@@ -297,14 +297,8 @@ def own_id() -> Iterator[Any]:
     """Return a function that registers ids of Reach with options of their own."""
 
     def register(name: str, **options: Any) -> str:
-        spec = gym.spec("TPMReach-v0")
-        gym.register(
-            name,
-            entry_point=spec.entry_point,
-            vector_entry_point=spec.vector_entry_point,
-            max_episode_steps=3,
-            kwargs={**spec.kwargs, **options},
-        )
+        reach = "TPMReach-v0"
+        register_like(reach, name, steps=3, kwargs={**gym.spec(reach).kwargs, **options})
         return name
 
     with registries_put_back():

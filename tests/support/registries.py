@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 from unittest.mock import patch
 
 import gymnasium as gym
@@ -22,3 +23,15 @@ def registries_put_back(*modules: str) -> Iterator[None]:
         sys.modules.pop(module, None)
     with patch.dict(gym.registry), patch.dict(TASKS):
         yield
+
+
+def register_like(like: str, name: str, *, steps: int, kwargs: dict[str, Any]) -> None:
+    """Register an id whose environments are of the classes of ``like``, with other arguments."""
+    spec = gym.spec(like)
+    gym.register(
+        name,
+        entry_point=spec.entry_point,
+        vector_entry_point=spec.vector_entry_point,
+        max_episode_steps=steps,
+        kwargs=kwargs,
+    )

@@ -39,7 +39,7 @@ from tpm_gym.learning.configuration import (
     complete,
     unset,
 )
-from tpm_gym.learning.environments import check_env_id, import_module_of, make_envs
+from tpm_gym.learning.environments import USUAL, check_env_id, import_module_of, make_envs
 from tpm_gym.learning.errors import ConfigError
 from tpm_gym.learning.evaluation import bar
 from tpm_gym.learning.policies import NoisyPolicy, load_policy
@@ -52,7 +52,7 @@ from tpm_gym.learning.rollout import (
     run_episodes,
     summarise,
 )
-from tpm_gym.mechanism.machine import Machine, find_machine, machine_names
+from tpm_gym.mechanism.machine import Machine, registered_name
 from tpm_gym.tasks.registry import TASKS, make_task
 from tpm_gym.tasks.task import Task
 
@@ -121,7 +121,7 @@ class Dataset:
     @property
     def name(self) -> str:
         """Id in Minari."""
-        own = check_env_id(self.env).kwargs.get("engine") or "pybullet"
+        own = check_env_id(self.env).kwargs.get("engine") or USUAL["engine"]
         given = {"engine": own, **self.config.env_options.given()}
         if given["engine"] == "analytic":  # the command's default
             del given["engine"]
@@ -222,8 +222,7 @@ def _stored(env: str, options: EnvOptions) -> EnvSpec:
     spec = copy.deepcopy(check_env_id(env))
     spec.kwargs |= options.given()
     if isinstance(machine := spec.kwargs.get("machine"), Machine):
-        names = (name for name in machine_names() if find_machine(name) == machine)
-        spec.kwargs["machine"] = next(names, machine)
+        spec.kwargs["machine"] = registered_name(machine) or machine
     if isinstance(task := spec.kwargs.get("task"), type):
         names = (name for name, kind in TASKS.items() if kind is task)
         spec.kwargs["task"] = next(names, task)

@@ -100,12 +100,13 @@ def set_by(env_id: str) -> dict[str, Any] | None:
     return {name: value for name, value in spec.kwargs.items() if value is not None}
 
 
-def named(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return machine, engine, drive and shield of ``options``, as plain data for files.
+def conditions_set_by(env_id: str) -> dict[str, Any]:
+    """Return machine, engine, drive and shield that an id's registration sets, as plain data.
 
     A machine is written as its name. If a different machine is registered under this name, a suffix
     is appended, so that the name never stands for the wrong machine.
     """
+    options = set_by(env_id) or {}
     found = {name: options[name] for name in USUAL if name in options}
     if isinstance(machine := found.get("machine"), Machine):
         found["machine"] = machine.name

@@ -31,9 +31,9 @@ from tpm_gym.learning.configuration import (
 from tpm_gym.learning.environments import (
     USUAL,
     check_env_id,
+    conditions_set_by,
     import_module_of,
     make_envs,
-    named,
     set_by,
 )
 from tpm_gym.learning.errors import ConfigError
@@ -215,7 +215,7 @@ def _conditions(env_id: str, given: Mapping[str, Any]) -> dict[str, Any]:
     A value that is not given is the default of ``env_id``.
     """
     check_env_id(env_id)
-    return {**USUAL, **named(set_by(env_id) or {}), **given}
+    return {**USUAL, **conditions_set_by(env_id), **given}
 
 
 def _shown(config: EvaluationConfig) -> dict[str, str]:

@@ -29,10 +29,9 @@ from tpm_gym.learning.algorithms import ALGORITHMS, NAMES, Actor
 from tpm_gym.learning.configuration import UNSET, EnvOptions
 from tpm_gym.learning.environments import (
     check_env_id,
+    conditions_set_by,
     import_module_of,
     make_env,
-    named,
-    set_by,
 )
 from tpm_gym.learning.errors import ConfigError, PolicyError
 from tpm_gym.learning.features import GoalGapExtractor
@@ -140,7 +139,7 @@ def save(
             "format": FORMAT,
             "version": VERSION,
             "env": env_id,
-            "env_options": {**named(set_by(env_id) or {}), **(env_options or {})},
+            "env_options": {**conditions_set_by(env_id), **(env_options or {})},
             "algorithm": algorithm,
             "seed": seed,
             "steps": model.num_timesteps,

@@ -11,7 +11,7 @@ import numpy as np
 
 import tpm_gym
 from tpm_gym import TPMError
-from tpm_gym.learning.environments import USUAL, named, set_by
+from tpm_gym.learning.environments import USUAL, conditions_set_by, set_by
 from tpm_gym.learning.errors import PolicyError
 from tpm_gym.learning.rollout import Action, Observation, Policy
 from tpm_gym.resources import POLICIES
@@ -131,8 +131,8 @@ def trained_in(spec: str) -> tuple[str, dict[str, Any]] | None:
     if spec in SCRIPTED:
         return None
     about = _exported(spec).description
-    own = set_by(about.env_id)
-    found = {**USUAL, **named(own)} if own is not None else {}
+    registered = set_by(about.env_id) is not None
+    found = {**USUAL, **conditions_set_by(about.env_id)} if registered else {}
     return about.env_id, found | {str(name): value for name, value in about.env_options.items()}
 
 

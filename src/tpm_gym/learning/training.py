@@ -32,11 +32,10 @@ from tpm_gym.learning.configuration import UNSET, ResumeConfig, TrainingConfig, 
 from tpm_gym.learning.demonstrations import Demonstrations
 from tpm_gym.learning.environments import (
     check_env_id,
+    conditions_set_by,
     import_module_of,
     make_env,
     make_envs,
-    named,
-    set_by,
 )
 from tpm_gym.learning.errors import (
     CheckpointError,
@@ -114,7 +113,7 @@ def train(config: TrainingConfig, console: Console | None = None) -> signal.Sign
         _say(console, f"note: learning starts at step {starts:,}, so nothing will be learned")
     description = {
         **config.record(),
-        "id_options": named(set_by(config.env) or {}),
+        "id_options": conditions_set_by(config.env),
         "training_seeds": [config.seed, config.seed + config.envs - 1],
         "evaluation_seeds": [SELECTION_SEED, SELECTION_SEED + config.eval_episodes - 1],
         **provenance.origin(),

@@ -466,6 +466,11 @@ def machine_names() -> tuple[str, ...]:
     return tuple(_MACHINES)
 
 
+def registered_name(machine: Machine) -> str | None:
+    """Return the first name under which an equal machine is registered; None if there is none."""
+    return next((name for name in _MACHINES if find_machine(name) == machine), None)
+
+
 def find_machine(machine: Any) -> Machine:
     """Return a machine by its name, or the machine itself.
 

@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from tpm_gym.errors import TPMError
-from tpm_gym.mechanism.machine import Machine, machine_names
+from tpm_gym.mechanism.machine import Machine, machine_names, registered_name
 from tpm_gym.viewer import server
 from tpm_gym.viewer.explore import Explore, units
 from tpm_gym.viewer.kinds import Kind, Posture, find_kind
@@ -126,9 +126,8 @@ def _named_kinds(machine: str | Machine) -> tuple[str, dict[str, Kind]]:
     kinds = {name: find_kind(name) for name in machine_names()}
     if isinstance(machine, str):
         return machine, kinds
-    for name, kind in kinds.items():
-        if kind.machine == machine:
-            return name, kinds
+    if (name := registered_name(machine)) is not None:
+        return name, kinds
     name = f"{machine.name} (own)" if machine.name in kinds else machine.name
     return name, {**kinds, name: given}
 
